@@ -12,6 +12,7 @@ from reconstruction import Step
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, SafetyRefusal
+from stage_service.devices.lights.interface import lamps_lit, mismatch_todo
 from stage_service.plan.flash import FASTEST_HZ, SLOW_HZ, SLOWEST_HZ, Trains
 
 
@@ -121,11 +122,11 @@ class Exposing:
         lights = self._devices.lights
         if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
             return
-        lit, expected = lights.status().lit, 1 if step.kind == "olat" else lights.count
-        if lit != expected:
-            doing = f"looking after the exposure of step {step.index}"
-            todo = "Watchdog, interlock or emergency stop put them off: clear the cause."
-            raise DeviceError(lights.name, doing, f"{expected} lamps lit", f"{lit} lit", todo)
+        status, expected = lights.status(), 1 if step.kind == "olat" else lights.count
+        if status.lit != expected:
+            doing = f"looking after the exposure of step {step.index} ({step.light or step.kind})"
+            received, todo = f"{status.lit} lit{status.causes}", mismatch_todo(expected, status)
+            raise DeviceError(lights.name, doing, lamps_lit(expected), received, todo)
 
     def _check_projectors(self, step: Step) -> None:
         """The same for projectors, which go dark when nobody feeds their watchdog."""
@@ -133,7 +134,7 @@ class Exposing:
         projected = step.kind in ("scanline", "tracking")
         if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
             doing = f"looking after the exposure of step {step.index}"
-            todo = "Its watchdog put it dark, or it lost power: check its cable."
+            todo = "Its watchdog switched it off, or it lost power: check its cable."
             raise DeviceError(beams.name, doing, "the row shown", "darkness", todo)
 
     def _sleep(self, seconds: float) -> None:

@@ -86,7 +86,10 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
         except queue.Empty:
             problem = f" {device.name}: not dark within {within_s:.3g} s."
         if problem and can.dead_man:
-            problem += f" Its watchdog darkens it within {config.watchdog_s:g} s."
+            problem += (
+                f" Its watchdog puts it off {config.watchdog_s:g} s after the service's last "
+                "heartbeat; what is lit after that does not obey it: cut the supply."
+            )
         problems += problem
         if not problem and not can.reads_back:
             unread += f" {device.name}: off was sent, but cannot be read back."

@@ -30,7 +30,7 @@ from stage_service.plan.stepping import SHORTEST_RUN
 Notify = Callable[[str, dict[str, Any]], None]
 ORDERLY_S = 0.5
 """How long whoever darkens a run waits for it to do so itself."""
-WHILE_PAUSED = "Mend it first: while this lasts, resuming fails the capture, whose frames are kept."
+WHILE_PAUSED = "Remove the cause first: until then resuming fails the capture; its frames are kept."
 MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
 
 

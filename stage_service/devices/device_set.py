@@ -76,7 +76,9 @@ class DeviceSet:
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            LimitedLightBank(lights, rig_file.safety, past=lit),
+            LimitedLightBank(
+                lights, rig_file.safety, past=lit, lights=[light.name for light in rig.lights]
+            ),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(cameras),

@@ -27,12 +27,39 @@ class LightCapabilities:
 
 @dataclass(frozen=True)
 class LightStatus:
-    """What the bank says of itself; `lit` counts the lamps that are on."""
+    """What the bank reports of itself; `lit` counts the lamps that are on."""
 
     watchdog_tripped: bool
     interlock_open: bool
     estop_pressed: bool
     lit: int
+
+    @property
+    def causes(self) -> str:
+        """Which of the three puts lamps off now, in words that follow a count; often none."""
+        return (
+            ", its watchdog has tripped" * self.watchdog_tripped
+            + ", the interlock is open" * self.interlock_open
+            + ", the emergency stop is pressed" * self.estop_pressed
+        )
+
+
+def lamps_lit(count: int) -> str:
+    """A number of lamps, as errors have it."""
+    return f"{count} lamp{'' if count == 1 else 's'} lit"
+
+
+def mismatch_todo(expected: int, status: LightStatus) -> str:
+    """What to do where a bank reports another number of lit lamps than was commanded."""
+    if status.causes:
+        return "Clear the cause at the stage."
+    if status.lit < expected:
+        return f"{CONTRADICTS}: look at the lamps, and check their drivers' supply."
+    return "Check the lamp drivers, and that nobody else writes to the bank."
+
+
+CONTRADICTS = "The bank's read-back contradicts the command"
+"""It reports lamps as off that were commanded on, and no cause; the console looks for this."""
 
 
 class LightBank(Protocol):

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
 from stage_service.config import SafetyLimits
-from stage_service.devices.errors import SafetyRefusal
+from stage_service.devices.errors import DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import LightBank, LightStatus, Lit
 
 LitTimes = dict[int, deque[tuple[float, float]]]
@@ -25,7 +25,7 @@ class LimitedLightBank:
     From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
     is left to its own watchdog; `connect` begins anew. Sequences that the trigger box clocks are
     checked entry by entry, before any is lit. `past` has how long lamps were lit before, and goes
-    on being kept.
+    on being kept. `lights` are the lamps' names in the rig, for errors.
     """
 
     def __init__(
@@ -34,9 +34,11 @@ class LimitedLightBank:
         limits: SafetyLimits,
         clock: Callable[[], float] = time.monotonic,
         past: LitTimes | None = None,
+        lights: Sequence[str] = (),
     ) -> None:
         self.name, self.capabilities = bank.name, bank.capabilities
         self._bank, self._limits, self._clock = bank, limits, clock
+        self._lights = lights
         self._level = 1.0  # what a bank has at power-up, and one without levels always
         self._since: dict[int, float] = {}
         self._past: LitTimes = {} if past is None else past
@@ -75,9 +77,12 @@ class LimitedLightBank:
             self._bank.all_on()
 
     def off(self) -> None:
-        """Put every lamp off; never refused."""
+        """Put every lamp off; never refused. An error names what may still be lit."""
         with self._changed:
-            self._bank.off()
+            try:
+                self._bank.off()
+            except DeviceError as error:
+                raise self._naming_the_lit(error) from error
             self._lit(())
             self._forget_what_did_not_come()
 
@@ -239,6 +244,16 @@ class LimitedLightBank:
     def _raise_refusal(self) -> None:
         if self._refusal is not None:
             raise self._refusal
+
+    def _naming_the_lit(self, error: DeviceError) -> DeviceError:
+        if not self._since:
+            return error
+        lamp = min(self._since)
+        name = self._lights[lamp] if lamp < len(self._lights) else f"lamp {lamp}"
+        last = f"{name} was" if len(self._since) == 1 else f"{len(self._since)} lamps were"
+        received = f"{error.received} ({last} lit last)"
+        told = error.device, error.operation, error.expected, received, error.todo
+        return type(error)(*told, deadline_s=error.deadline_s)
 
     def _watch(self) -> None:
         """Run `enforce` whenever it is due; a lamp that is lit later is due later."""

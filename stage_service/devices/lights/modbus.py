@@ -12,7 +12,13 @@ from reconstruction.geometry.rig import RigError
 from stage_service.config import OWNER_WORDS, LightRegisters, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits, modbus_answers
-from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
+from stage_service.devices.lights.interface import (
+    LightCapabilities,
+    LightStatus,
+    Lit,
+    lamps_lit,
+    mismatch_todo,
+)
 from stage_service.devices.lights.modbus_links import ModbusLink, open_link
 
 ALL_ON, ALL_OFF = 65535, 0
@@ -238,16 +244,8 @@ class ModbusLightBank:
         status = self.status()
         if status.lit == lit:
             return
-        causes = (
-            ", its watchdog has tripped" * status.watchdog_tripped
-            + ", the interlock is open" * status.interlock_open
-            + ", the emergency stop is pressed" * status.estop_pressed
-        )
-        received = f"{status.lit} lit{causes}"
-        todo = "Check the lamp drivers' supply, and that nobody else writes to the bank."
-        if causes:
-            todo = "Clear the cause at the stage."
-        raise self._error(doing, f"{lit} lamps lit", received, todo)
+        received = f"{status.lit} lit{status.causes}"
+        raise self._error(doing, lamps_lit(lit), received, mismatch_todo(lit, status))
 
     def _write(self, values: list[int], first: int, doing: str) -> None:
         """Write registers from `first` on, in chunks."""

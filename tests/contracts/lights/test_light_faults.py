@@ -158,7 +158,7 @@ def test_a_lamp_that_cannot_be_put_off_is_seen(bench, wire):
     one.lamps.stick()
     with pytest.raises(DeviceError, match="all lamps off: expected 0 lamps lit, received 1 lit"):
         one.driver.off()
-    with pytest.raises(DeviceError, match="expected 1 lamps lit, received 2 lit"):
+    with pytest.raises(DeviceError, match="expected 1 lamp lit, received 2 lit"):
         one.driver.select(6)
 
 
@@ -166,7 +166,7 @@ def test_a_lamp_that_cannot_be_put_off_is_seen(bench, wire):
 def test_a_bank_that_lies_about_its_lamps_is_caught_when_they_are_put_on(bench, wire):
     one = bench(wire, Fault("lights", "lies", 1))
     one.pulses = 1
-    with pytest.raises(DeviceError, match="expected 1 lamps lit, received 0 lit"):
+    with pytest.raises(DeviceError, match="expected 1 lamp lit, received 0 lit"):
         one.driver.select(5)
     one.driver.off()
     assert one.lit() == []
@@ -176,6 +176,13 @@ def test_the_cause_of_dark_lamps_is_told(bench):
     one = bench(TCP)
     one.lamps.cut_by(lambda: (False, True))
     with pytest.raises(DeviceError, match=r"0 lit, the emergency stop is pressed. Clear the cause"):
+        one.driver.select(1)
+
+
+def test_a_count_without_a_cause_is_a_contradiction(bench):
+    one = bench(TCP, Fault("lights", "lies", 1))
+    one.pulses = 1
+    with pytest.raises(DeviceError, match=r"received 0 lit\. The bank's read-back contradicts"):
         one.driver.select(1)
 
 

@@ -132,7 +132,7 @@ def test_a_busy_camera_is_waited_for(rig_file, world, tmp_path):
     ("fault", "text"),
     [
         ({"mute": {"cam_1"}}, "camera cam_1"),
-        ({"dead_lamps": True}, "putting lamp 3 on: expected 1 lamps lit, received 0 lit"),
+        ({"dead_lamps": True}, "putting lamp 3 on: expected 1 lamp lit, received 0 lit"),
         ({"interlock": True}, "interlock open"),
         ({"estop": True}, "emergency stop pressed"),
         ({"late": ["PULSE 2000"]}, "firing the cameras: expected a line within"),
@@ -151,6 +151,41 @@ def test_trouble_fails_the_capture_dark_and_named(rig_file, world, tmp_path, fau
     assert manifest["blackout"]["safe"]
 
 
+def test_an_emergency_stop_in_mid_exposure_is_named(rig_file, world, tmp_path):
+    run = sequencer(rig_file, tmp_path / "c")
+    pulse = run.devices.trigger.pulse
+
+    def stopped(exposure: float) -> int:
+        count = pulse(exposure)
+        if count == 3:
+            world.lit, world.estop = set(), True
+        return count
+
+    run.devices.trigger.pulse = stopped  # type: ignore[method-assign]
+    assert run.run() == "failed"
+    told = "received 0 lit, the emergency stop is pressed. Clear the cause at the stage."
+    assert told in str(run.error)
+    assert "watchdog" not in str(run.error).partition("; blackout")[0]
+
+
+def test_a_lamp_that_stays_lit_is_named(rig_file, world, tmp_path):
+    run = sequencer(rig_file, tmp_path / "c")
+    pulse = run.devices.trigger.pulse
+
+    def stick(exposure: float) -> int:
+        count = pulse(exposure)
+        world.stuck_lamps = count == 3
+        return count
+
+    run.devices.trigger.pulse = stick  # type: ignore[method-assign]
+    assert run.run() == "failed"
+    (lamp,) = world.lit
+    told = f"expected 0 lamps lit, received 1 lit (light_{lamp:03d} was lit last)"
+    assert told in str(run.error)
+    assert run.blackout is not None
+    assert told in run.blackout.detail
+
+
 def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, tmp_path):
     run = sequencer(rig_file, tmp_path / "c")
     pulse = run.devices.trigger.pulse
@@ -163,7 +198,8 @@ def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, 
 
     run.devices.trigger.pulse = cut  # type: ignore[method-assign]
     assert run.run() == "failed"
-    assert "after the exposure of step 2: expected 1 lamps lit, received 0 lit" in str(run.error)
+    told = "after the exposure of step 2 (light_003): expected 1 lamp lit, received 0 lit. The bank"
+    assert told in str(run.error)
     assert max(step for step, _ in Capture(tmp_path / "c").records) == 1
 
 
@@ -214,7 +250,7 @@ def test_while_paused_a_bank_that_dies_is_told_and_one_that_is_mended_goes_on(
     assert [text is not None for text in told] == [False, True, False]
     assert told[1] is not None
     assert told[1].startswith("light bank")
-    assert "lamps off. Mend it first: while this lasts, resuming fails the capture" in told[1]
+    assert "lamps off. Remove the cause first: until then resuming fails the capture" in told[1]
     assert run.error is None
     assert verify(tmp_path / "c") == []
 
