@@ -14,7 +14,16 @@ from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import Entry
 from stage_service.captures.latch import Latched
-from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Strict, Text
+from stage_service.config import (
+    CaptureDefaults,
+    DevicesConfig,
+    DmxConfig,
+    Exposure,
+    Level,
+    RigFile,
+    Strict,
+    Text,
+)
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 
@@ -292,7 +301,9 @@ class Looking(Standing):
 
 class RigView(BaseModel):
     """The rig: where its lights, cameras and projectors stand, and what a plan gets where it does
-    not say otherwise. `living_subject`: flashes of 3 to 30 Hz need consent."""
+    not say otherwise. `living_subject`: flashes of 3 to 30 Hz need consent. `watchdog_s`: so many
+    seconds after the service's last heartbeat the light bank puts its lamps off by itself; None:
+    it has no watchdog."""
 
     name: str
     lights: list[Standing]
@@ -301,6 +312,7 @@ class RigView(BaseModel):
     defaults: CaptureDefaults
     hardware_stepping: bool
     living_subject: bool
+    watchdog_s: float | None
 
     @classmethod
     def of(cls, rig_file: RigFile) -> Self:
@@ -314,7 +326,16 @@ class RigView(BaseModel):
             defaults=rig_file.capture,
             hardware_stepping=devices is not None and devices.hardware_stepping,
             living_subject=rig_file.safety.living_subject,
+            watchdog_s=None if devices is None else _watchdog_s(devices),
         )
+
+
+def _watchdog_s(devices: DevicesConfig) -> float | None:
+    lights = devices.lights
+    if isinstance(lights, DmxConfig):
+        return None
+    registers = lights.registers
+    return None if None in (registers.heartbeat, registers.watchdog) else devices.watchdog_s
 
 
 def _vector(array: AnyFloats) -> Vector:

@@ -23,6 +23,10 @@ LOOK_S = 0.5
 PACE_S = 1e-3
 """From one round of news to the next, for each listener: telling one takes a fraction of it, so
 that requests have the rest."""
+PULSE_S = 1.0
+"""A stream that has no event for so long carries a comment: whoever reads it can tell a service
+that has nothing to report from one that has stopped."""
+_PULSE = b": pulse\r\n\r\n"
 MOST_AT_ONCE, MOST_PLACES = 500, 20
 """Events in one piece, and pieces that are kept for others who stand at the same place."""
 
@@ -105,7 +109,7 @@ async def stream_events(
 
     Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
     a number that it has not reached yet is from before a restart, and replays everything. A token
-    that is revoked, or a login that ends, ends it.
+    that is revoked, or a login that ends, ends it. Without events a comment comes every second.
     """
     feed: Feed = request.app.state.feed
     if feed.listeners >= MOST_STREAMS:
@@ -113,19 +117,25 @@ async def stream_events(
     asked = last_event_id if last_event_id is not None else after
     newest = request.app.state.service.events.last
     start = newest if asked is None else asked
-    return EventSourceResponse(_follow(request, feed, start if start <= newest else 0))
+    follow = _follow(request, feed, start if start <= newest else 0)
+    return EventSourceResponse(follow, ping=86400)  # `_PULSE` replaces its comments
 
 
 async def _follow(request: Request, feed: Feed, number: int) -> AsyncIterator[bytes]:
     clock = asyncio.get_running_loop().time
     feed.listeners += 1
+    sent = clock()
     try:
         while _may(request):
             looked = clock()
             while (left := looked + LOOK_S - clock()) > 0:
                 number, text = await feed.after(number, left)
                 if text:
+                    sent = clock()
                     yield text
+            if clock() - sent >= PULSE_S:
+                sent = clock()
+                yield _PULSE
     finally:
         feed.listeners -= 1
 

@@ -22,12 +22,12 @@ from reconstruction import Model, Step, read_exr
 from stage_service.api.app import create_app
 from stage_service.api.connections import LOOPBACK
 from stage_service.api.problems import KINDS, Problem, errors_page
-from stage_service.config import RigFile
+from stage_service.config import LightRegisters, RigFile
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.plan import resolved, steps
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.service import Service
-from stage_service.service_models import CaptureRequest, CaptureView, JobRequest
+from stage_service.service_models import CaptureRequest, CaptureView, JobRequest, RigView
 
 SHORT = {
     "lights": ["light_003", "light_000"],
@@ -317,6 +317,21 @@ def test_what_a_page_shows_of_a_capture(http, rig_file):
     camera = rig_file.rig.cameras[0]
     ahead = camera.rays([[(camera.width - 1) / 2, (camera.height - 1) / 2]])[0]
     assert rig["cameras"][0]["towards"] == pytest.approx(ahead.tolist(), abs=1e-6)
+    assert rig_file.devices is not None
+    assert rig["watchdog_s"] == rig_file.devices.watchdog_s
+
+
+def test_a_bank_without_a_watchdog_has_no_seconds(rig_file):
+    assert rig_file.devices is not None
+    lights = rig_file.devices.lights.model_copy(update={"registers": LightRegisters(watchdog=None)})
+    devices = rig_file.devices.model_copy(update={"lights": lights})
+    assert RigView.of(replace(rig_file, devices=devices)).watchdog_s is None
+
+
+def test_a_stream_without_events_shows_that_the_service_lives(http):
+    with http.stream("GET", "/events") as response:
+        comments = (line for line in response.iter_lines() if line)
+        assert [next(comments), next(comments)] == [": pulse", ": pulse"]
 
 
 def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list[dict[str, Any]]:
