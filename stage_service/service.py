@@ -246,7 +246,7 @@ class Service:
 
         def work() -> CaptureStatus:
             self._captures.get(capture_id)  # one that there is not holds nothing up
-            self.queue.hold(f"capture {capture_id} was to be aborted by {by}")
+            self.queue.hold(f"abort of capture {capture_id} by {by}")
             return self._captures.abort(capture_id)
 
         return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
@@ -293,7 +293,7 @@ class Service:
     def calibrated(self) -> Path:
         """The calibrated rig file. Raises `NotThere`."""
         if not self.calibrating.rig.is_file():
-            raise NotThere("no rig was calibrated here yet: POST /calibration")
+            raise NotThere("no rig has been calibrated here yet")
         return self.calibrating.rig
 
     def done_capture(self, capture_id: str) -> Path:

@@ -99,7 +99,7 @@ class Storage:
         """The model of that name. Raises `NotThere`."""
         path = self._root / "models" / name
         if not is_file_name(name) or not path.is_dir():
-            raise NotThere(f"there is no model {name!r}; GET /models lists those there are")
+            raise NotThere(f"there is no model {name!r}")
         return Model(path)
 
     def remove_capture(
@@ -166,7 +166,7 @@ class Storage:
         with self._emptying:
             found = next((r for r in self.trash() if r.name == name), None)
             if found is None:
-                raise NotThere(f"nothing in the trash is called {name!r}; GET /trash lists what is")
+                raise NotThere(f"the trash has no {name!r}")
             return self._restore(found, by)
 
     def _restore(self, found: Removed, by: Caller) -> Removed:
@@ -239,7 +239,7 @@ class Storage:
         """Head and folder of masks of a subject, where there are any. Raises `NotThere`."""
         folder = self._uploads / subject
         if not is_file_name(subject) or not folder.is_dir():
-            raise NotThere(f"nothing was uploaded as {subject!r}; GET /uploads lists what was")
+            raise NotThere(f"no subject was uploaded as {subject!r}")
         head, masks = folder / "head.obj", folder / "masks"
         return head if head.is_file() else None, masks if masks.is_dir() else None
 

@@ -261,7 +261,7 @@ class CaptureQueue(Background):
         for entry in self._kept.waiting:
             if entry.id == name:
                 return entry
-        raise UnknownEntry(f"nothing waits as {name!r}; GET /queue lists what does")
+        raise UnknownEntry(f"the queue has no entry {name!r}: it was started or removed")
 
     def _to_history(
         self, entry: Entry, state: Literal["started", "removed"], capture: str | None = None

@@ -19,7 +19,7 @@ class UnknownCapture(LookupError):
     """No capture has this id."""
 
     def __init__(self, capture_id: str) -> None:
-        super().__init__(f"there is no capture {capture_id!r}; GET /captures lists those there are")
+        super().__init__(f"there is no capture {capture_id!r}")
 
 
 class Catalogue:

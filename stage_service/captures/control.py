@@ -22,8 +22,8 @@ MOST_BLACKOUTS = 16
 """That go on at once; whoever asks for one more gets what the last of them comes to."""
 LATE = Blackout(
     False,
-    "unknown, unsafe: not everything has said in time that it is dark. It is tried on; GET /health "
-    "and the event stage.blackout tell what it comes to",
+    "unknown, unsafe: not every lamp and projector was read back dark in time. The blackout goes "
+    "on: treat every lamp as lit until it reports dark",
 )
 
 

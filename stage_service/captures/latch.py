@@ -42,8 +42,8 @@ class Latched:
     def way_out(self) -> str:
         """What ends it."""
         if self.reads_back:
-            return "until POST /devices/blackout reads it back dark"
-        return "until somebody has looked and says so with POST /devices/acknowledge"
+            return "until a blackout reads every lamp back dark"
+        return "until somebody has looked and acknowledges that the lamps are off"
 
 
 class Latch:
@@ -93,8 +93,8 @@ class Latch:
             raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
         if latched.reads_back:
             raise CannotAcknowledge(
-                "this light bank says itself whether its lamps are off: ask for a blackout "
-                "(POST /devices/blackout) once it answers"
+                "this light bank reports itself whether its lamps are off: send a blackout once it "
+                "answers"
             )
 
     def acknowledge(self) -> None:

@@ -49,7 +49,7 @@ GIVEN_UP_S = 5.0
 """A blackout is over within this time, or three times the slowest timeout_s of the devices."""
 TOLD_S = 1.0
 """What has not been read back dark by then is told as unknown, before the blackout is answered."""
-UNREAD = "a blackout is under way: not everything has said yet that it is dark"
+UNREAD = "a blackout is under way: not every lamp and projector has been read back dark yet"
 
 
 class Busy(RuntimeError):
@@ -370,7 +370,7 @@ class CaptureManager:
             except (Busy, Unsafe) as error:
                 return str(error)
             if not self.stage.known_dark:
-                return "nobody knows yet whether the stage is dark"
+                return "whether the stage is dark is not known yet"
         return None
 
     def not_dark(self) -> str | None:

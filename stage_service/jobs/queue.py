@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
 import secrets
 import sqlite3
 import threading
@@ -53,6 +54,10 @@ SILENT_S = 20
 """One that has not acknowledged what was sent by then, too."""
 STATEMENT_S = 8
 """The service waits no longer for an answer; a worker has the time."""
+
+
+_RAISED = re.compile(r"^\([a-z_0-9.]+\.\w+\) ")
+"""The class of a database driver's error, which SQLAlchemy puts in front of its sentence."""
 
 
 class NoSuchJob(LookupError):
@@ -247,7 +252,8 @@ class JobQueue:
                 client = self._client
             yield client
         except Exception as error:
-            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+            first = next(iter(str(error).splitlines()), "") or type(error).__name__
+            reason = _RAISED.sub("", first)
             self.problem = f"the job database cannot be used: {reason}"
             raise JobsUnavailable(self.problem) from error
         self.problem = None

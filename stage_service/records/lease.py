@@ -20,8 +20,8 @@ class Leased(RuntimeError):
 
     def __init__(self, lease: Lease) -> None:
         super().__init__(
-            f"{lease.holder} steers the stage until {lease.expires}; wait, or ask them to release "
-            "the lease. Abort and blackout are open to everybody"
+            f"{lease.holder} steers the stage until {lease.expires}. Wait, or have them release "
+            "the lease; abort and blackout are open to everybody"
         )
         self.holder, self.expires = lease.holder, lease.expires
 
@@ -103,9 +103,7 @@ class Leases:
     def _own(self, token: str) -> Lease:
         held = self._now()
         if held is None or not _same(token, held.token):
-            raise NoLease(
-                "this token is no lease's: it has expired or was released; take a new one"
-            )
+            raise NoLease("this lease has expired or was released: take a new one")
         return held
 
     def _keep(self, token: str, holder: str, seconds: float) -> Lease:

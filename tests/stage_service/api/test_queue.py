@@ -82,7 +82,9 @@ def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(ht
     until(lambda: http.get(f"/captures/{running}").json()["state"] == "done")
     world.dead_lamps = False
     reason = until(lambda: http.get("/queue").json()["held"])
-    assert {"abort": "aborted by", "blackout": "blackout by", "failure": "failed"}[how] in reason
+    assert {"abort": "abort of capture", "blackout": "blackout by", "failure": "failed"}[
+        how
+    ] in reason
     pulses = world.pulses
     # Long enough for the queue's thread to have looked once more.
     http.service.events.wait(http.service.events.last, 1.2)
@@ -101,7 +103,7 @@ def test_who_aborts_what_is_not_there_or_over_is_told_the_truth(http):
     assert http.get("/queue").json()["held"] is None
     over = http.post(f"/captures/{done}/abort").json()
     assert over["detail"].endswith("that is done (completed); possible now: nothing")
-    assert "to be aborted by" in http.get("/queue").json()["held"]
+    assert "abort of capture" in http.get("/queue").json()["held"]
     refused = [a for a in http.get("/audit").json() if a["action"] == "capture.abort"]
     assert [a["result"] for a in refused] == ["refused", "refused"]
 

@@ -152,7 +152,7 @@ def test_a_stage_that_is_not_dark_is_latched_and_stays_so_over_a_restart(rig_fil
         refused(http.post("/captures", json={"plan": SHORT}), "unsafe")
         word = {"name": "Ada", "note": "all dark, I looked"}
         problem = refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
-        assert "ask for a blackout" in problem["detail"]
+        assert "send a blackout" in problem["detail"]
         world.stuck_lamps = False
         assert http.post("/devices/blackout").json()["safe"]
         refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")

@@ -84,7 +84,7 @@ def test_the_latch_holds_until_a_blackout_is_read_back_dark(tmp_path):
     assert latch.learn(LIT, reads_back=True) == "set"
     assert latch.learn(LIT, reads_back=True) is None
     again = Latch(tmp_path / "unsafe.json")
-    with pytest.raises(Unsafe, match=r"still lit.*until POST /devices/blackout reads it back dark"):
+    with pytest.raises(Unsafe, match=r"still lit.*until a blackout reads every lamp back dark"):
         again.check()
     with pytest.raises(CannotAcknowledge):
         again.acknowledge()
@@ -113,10 +113,10 @@ def test_a_damaged_latch_is_a_set_one(tmp_path, text):
     latch = Latch(tmp_path / "unsafe.json")
     with pytest.raises(Unsafe, match="could not be read"):
         latch.check()
-    with pytest.raises(CannotAcknowledge, match="ask for a blackout"):
+    with pytest.raises(CannotAcknowledge, match="send a blackout"):
         latch.acknowledge()
     assert latch.learn(LIT, reads_back=True) is None
-    with pytest.raises(CannotAcknowledge, match="ask for a blackout"):
+    with pytest.raises(CannotAcknowledge, match="send a blackout"):
         latch.acknowledge()
     assert latch.learn(DARK, reads_back=True) == "cleared"
     Latch(tmp_path / "unsafe.json").check()

@@ -117,6 +117,7 @@ def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatc
             with pytest.raises(JobsUnavailable, match="the job database cannot be used"):
                 queue.all()
             assert queue.problem is not None
+            assert "psycopg" not in queue.problem
             queue.close()
 
 
