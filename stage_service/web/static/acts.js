@@ -1,12 +1,12 @@
 // What people do, whichever view they are in.
 
-import { ask } from "./ask.js";
+import { ask, captureAt } from "./ask.js";
 import { button, h, seconds } from "./dom.js";
-import { S, busy, changed, load, refused, takeLease } from "./state.js";
+import { S, busy, load, refused, takeLease, unlit } from "./state.js";
 
 const notices = document.getElementById("notices");
 
-/** Tell the person something, for a while. */
+/** Show a sentence for a while. */
 export function notice(text, kind = "") {
   const made = h(`p.notice${kind ? "." + kind : ""}`, text);
   notices.append(made);
@@ -15,49 +15,22 @@ export function notice(text, kind = "") {
 
 const LEFT = new Error("left without a name");
 
-/** Do what a button is for; a refusal is told. */
+/** Do what a button is for; a refusal is shown. */
 export async function attempt(work) {
   try {
     return await work();
   } catch (error) {
     if (error === LEFT) return undefined;
-    notice(error.status === 401 ? "log in again" : error.message, "bad");
+    notice(error.status === 401 ? "Log in again." : error.message, "bad");
     return undefined;
   }
 }
 
 export async function abort() {
-  if (!busy()) return notice("no capture is being made");
+  if (!busy()) return notice("No capture is running.");
   const { id } = S.capture;
-  await attempt(() => ask(`POST /captures/${id}/abort`));
+  await attempt(() => ask(`POST ${captureAt(id)}/abort`));
   return load.capture(id).catch(() => {});
-}
-
-export let darkening = null;
-/** Put everything off. Where nobody answers it is asked again, until somebody does. */
-export async function blackout() {
-  if (darkening) return;
-  const began = performance.now();
-  for (let tries = 1; ; tries++) {
-    darkening = { tries };
-    changed();
-    try {
-      const answer = await ask("POST /devices/blackout", undefined, { patience: 20_000 });
-      const took = seconds((performance.now() - began) / 1000);
-      if (answer.safe) notice(`dark, verified, after ${took}`, "good");
-      else notice(answer.detail, "bad");
-      break;
-    } catch (error) {
-      if (error.status && error.status !== 503) { // 503: there was no room to take it
-        notice(`blackout refused: ${error.message}`, "bad");
-        break;
-      }
-      await new Promise((later) => setTimeout(later, 500));
-    }
-  }
-  darkening = null;
-  changed();
-  load.health().catch(() => {});
 }
 
 export function left(c) {
@@ -86,13 +59,13 @@ export async function askName() {
   });
 }
 
-/** A button that steers: off, and saying why, while this page may not. */
-export function steering(text, work, { ready = () => true, ...more } = {}) {
+/** A button that steers: disabled, with the reason as its title, while this page may not; `lights`: it has lamps lit. */
+export function steering(text, work, { ready = () => true, lights = false, ...more } = {}) {
   const made = button(text, () => attempt(work), more);
   return {
     element: made,
     update() {
-      const why = refused();
+      const why = refused() ?? (lights ? unlit() : null);
       made.disabled = why !== null || !ready();
       made.title = why ?? more.title ?? "";
     },

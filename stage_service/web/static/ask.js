@@ -1,8 +1,10 @@
 // The API: JSON in and out, problems as errors, in the name of whoever has logged in.
 
+import { local } from "./dom.js";
+
 export class Problem extends Error {
   constructor(status, data) {
-    super(data.detail ?? data.title ?? `HTTP ${status}`);
+    super(local(data.detail ?? data.title ?? `HTTP ${status}`));
     this.status = status;
     this.kind = String(data.type ?? "").split("#")[1] ?? "";
     this.data = data;
@@ -18,29 +20,47 @@ export const own = {
   },
 };
 
-export const login = new EventTarget();
+/** "word": the service has sent something; "over": nobody is logged in any more. A browser has six connections to a
+ * host: "yield" gives up pictures and their figures, so that a blackout has one, "yield all" every GET and the events;
+ * "yielded": all of it may be requested again. */
+export const service = new EventTarget();
+export const tell = (kind) => service.dispatchEvent(new Event(kind));
 const PATIENCE_MS = 30_000;
 
-export function headers() {
-  const lease = own.lease;
-  return lease ? { "Hairstage-Lease": lease.token } : {};
+const yielding = { "yield": new AbortController(), "yield all": new AbortController() };
+for (const kind of Object.keys(yielding)) {
+  service.addEventListener(kind, () => {
+    yielding[kind].abort(new Error("not loaded: the blackout went first"));
+    yielding[kind] = new AbortController();
+  });
 }
 
-/** `ask("POST /captures", {plan})`. Raises `Problem`, or `TypeError` where nobody answers. */
+/** `ask("POST /captures", {plan})`. Raises `Problem`, or `TypeError` where nobody answers.
+ *
+ * `more`: `signal` ends it, so does "yield" where it `yields`; `patience` is in milliseconds, `headers` are sent besides. */
 export async function ask(what, body, more = {}) {
   const [method, path] = what.split(" ");
+  const lease = own.lease;
+  const signals = [AbortSignal.timeout(more.patience ?? PATIENCE_MS)];
+  if (more.signal) signals.push(more.signal);
+  if (method === "GET") signals.push(yielding[more.yields ? "yield" : "yield all"].signal);
   const answer = await fetch(path, {
     method,
-    headers: { ...headers(), ...(body === undefined ? {} : { "content-type": "application/json" }) },
+    headers: { ...(lease ? { "Hairstage-Lease": lease.token } : {}), ...(body === undefined ? {} : { "content-type": "application/json" }), ...more.headers },
     body: body === undefined ? undefined : JSON.stringify(body),
     credentials: "same-origin",
     cache: "no-store",
-    signal: more.signal ?? AbortSignal.timeout(more.patience ?? PATIENCE_MS),
+    priority: more.priority ?? "auto",
+    signal: AbortSignal.any(signals),
   });
-  const data = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
+  const json = (answer.headers.get("content-type") ?? "").includes("json");
+  const data = json ? await answer.json() : null;
+  if (json) tell("word"); // a proxy's error page is none
   if (answer.ok) return data;
-  if (answer.status === 401 && what !== "POST /login") login.dispatchEvent(new Event("over"));
+  if (answer.status === 401 && what !== "POST /login") tell("over");
   throw new Problem(answer.status, data ?? {});
 }
 
+/** The path of a capture. */
+export const captureAt = (id) => `/captures/${encodeURIComponent(id)}`;
 export const get = (path, more) => ask(`GET ${path}`, undefined, more);

@@ -1,7 +1,8 @@
 // A screen that does not light the subject. Any key or touch ends it, and so does what must be seen.
 
 import { h } from "./dom.js";
-import { S, busy, onChange } from "./state.js";
+import { pressed } from "./blackout.js";
+import { S, busy, onChange, silence } from "./state.js";
 
 let cover = null;
 
@@ -22,7 +23,7 @@ export function blackScreen() {
   const was = busy();
   const stop = onChange(() => {
     word.textContent = busy() && S.capture.state === "running" ? `${S.capture.step} / ${S.capture.steps}` : "";
-    if (S.connected === false || S.health?.latch || S.failed || (was && !busy())) end();
+    if (S.out || silence() || pressed?.going || S.health?.latch || S.failed || (was && !busy())) end();
   });
   cover.stop = stop;
   return undefined;

@@ -1,7 +1,7 @@
 // A board in several poses and a sphere in several places; what each picture shows; the rig that comes of it.
 
 import { attempt, steering, underLease } from "./acts.js";
-import { ask, get } from "./ask.js";
+import { ask, captureAt, get } from "./ask.js";
 import { button, clock, h, number, numberIn, say, svg, words } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, busy, events } from "./state.js";
@@ -24,7 +24,7 @@ let came = () => {}; // for the view that is open
 async function learn() {
   if (!waiting) return;
   const { kind, id } = waiting;
-  const { state, outcome } = await get(`/captures/${id}`);
+  const { state, outcome } = await get(captureAt(id));
   if (state !== "done" || waiting?.id !== id) return;
   waiting = null;
   if (outcome !== "completed") return;
@@ -63,7 +63,7 @@ export function open(view) {
       const made = await ask("POST /captures", { plan });
       waiting = { kind, id: made.id };
       await learn();
-    }, { ready: () => !busy() });
+    }, { lights: true, ready: () => !busy() });
     return {
       kind, rows, shoot,
       element: h("section", h("h2", title), h("p.quiet", hint), h(".wide", { tabindex: "0", role: "region", "aria-label": `captures: ${title}` }, h("table.poses", kind === "boards" ? h("thead", h("tr", h("th", "capture"), S.rig.cameras.map((c) => h("th", c.name)), h("td"))) : "", rows)), h(".line", shoot.element)),
@@ -91,7 +91,7 @@ export function open(view) {
         const key = `${id}/${name}`;
         if (seen.has(key) || controller.signal.aborted) continue;
         seen.set(key, null);
-        seen.set(key, await get(`/captures/${id}/board/${name}?${query}`, { signal: controller.signal }).catch((error) => ({ error: error.message, corners: 0, pixels: [], off: [], rms_px: null, tilt_deg: null })));
+        seen.set(key, await get(`${captureAt(id)}/board/${encodeURIComponent(name)}?${query}`, { signal: controller.signal }).catch((error) => ({ error: error.message, corners: 0, pixels: [], off: [], rms_px: null, tilt_deg: null })));
         list();
         if (id === shown) show();
       }
@@ -102,11 +102,11 @@ export function open(view) {
     grid.hidden = heading.hidden = shown === null;
     if (shown === null) return;
     const id = shown;
-    const steps = await get(`/captures/${id}/steps`, { signal: controller.signal }).catch(() => []);
+    const steps = await get(`${captureAt(id)}/steps`, { signal: controller.signal }).catch(() => []);
     const lit = steps.find((s) => s.kind === "all_on") ?? steps.at(-1);
     if (id !== shown || !lit) return;
     say(heading, `${id}: what the cameras see${kept.boards.includes(id) ? `; lines: where the ${solution?.rig ? "calibrated" : "nominal"} lens has each corner, ${LONGER} times as far off` : ""}`);
-    cells.show((camera) => `/captures/${id}/frames/${lit.index}/${camera}`, { words: "all lights", lacks: lit.lacks, figures: false, query: [], over: (name) => marks(seen.get(`${id}/${name}`)) });
+    cells.show((camera) => `${captureAt(id)}/frames/${lit.index}/${encodeURIComponent(camera)}`, { words: "all lights", lacks: lit.lacks, figures: false, query: [], over: (name) => marks(seen.get(`${id}/${name}`)) });
   }
 
   const marks = (x) => (x?.pixels ?? []).flatMap(([u, v], i) => {

@@ -17,7 +17,7 @@ export function open(view) {
   const again = h("select", { name: "again", onchange: plan }, [[0, "once"], [2, "every 2 s"], [5, "every 5 s"], [15, "every 15 s"]].map(([v, t]) => h("option", { value: v }, t)));
   const marked = h("input", { type: "checkbox", checked: true, onchange: show });
   const figures = h("input", { type: "checkbox", checked: true, onchange: show });
-  const take = steering("Take a snapshot", shoot, { kind: "go", ready: () => !busy() });
+  const take = steering("Take a snapshot", shoot, { kind: "go", lights: true, ready: () => !busy() });
   const what = h("p.quiet", "A snapshot lights the stage for one exposure. It is kept until the next one, and is in no list.");
   const grid = h(".grid");
   const cells = pictures(grid, controller.signal);
@@ -50,7 +50,7 @@ export function open(view) {
   function show() {
     if (!last) return;
     const query = [`of=${encodeURIComponent(last.of)}`, ...(marked.checked ? ["mark=true"] : [])];
-    cells.show((camera) => `/captures/snapshot/frames/0/${camera}`, { words: last.light ?? "all lights", lacks: last.lacks, figures: figures.checked, query });
+    cells.show((camera) => `/captures/snapshot/frames/0/${encodeURIComponent(camera)}`, { words: last.light ?? "all lights", lacks: last.lacks, figures: figures.checked, query });
   }
 
   function plan() {

@@ -107,8 +107,11 @@ export function clock(iso) {
   if (!iso) return "–";
   const at = new Date(iso);
   const time = at.toLocaleTimeString("en-GB");
-  return at.toDateString() === new Date().toDateString() ? time : `${at.toISOString().slice(0, 10)} ${time}`;
+  return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString("sv")} ${time}`;
 }
+
+/** A sentence of the service, with its times (ISO 8601, UTC) as this machine's clock has them. */
+export const local = (text) => (text ?? "").replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)/g, (iso) => clock(iso));
 
 /** A name of the API in words, with its unit after a comma. */
 export const words = (name) => name.replace(/_(mm|px|deg|s|hz)$/, (_, unit) => `, ${unit === "hz" ? "Hz" : unit}`).replaceAll("_", " ");

@@ -11,8 +11,8 @@ const place = ([x, y, z]) => {
 
 /** A picture of `rig`; `onpick(name)` makes its lights be chosen by a click.
  *
- * `show({lit, shot, missing, chosen, projector})`: the light that is lit ("all" for all), sets of
- * names of those that were shot, lack frames, are chosen, and the projector that is on. */
+ * `show({lit, shot, missing, chosen, doubt, projector})`: the light that is lit ("all" for all), sets of names of
+ * those that were shot, lack frames, are chosen, may be lit, and the projector that is on. */
 export function dome(rig, { onpick = null, label = "" } = {}) {
   const lights = new Map();
   const radius = Math.min(0.05, 0.62 / Math.sqrt(rig.lights.length));
@@ -41,7 +41,7 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
     svg("circle", { class: "equator", r: Math.SQRT1_2 }),
     svg("path", { class: "head", d: "M-.05.025C-.05-.075.05-.075.05.025L.02.06 0 .085-.02.06Z" }),
     ...spots, ...devices);
-  let before = [null, null, null, null, null];
+  let before = [];
   // The one that is lit is another circle over all of them, which moves: nothing else is drawn anew.
   const named = svg("title");
   const over = svg("circle", { class: "light lit", r: radius.toFixed(4) }, named);
@@ -55,8 +55,8 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
 
   return {
     element,
-    show({ lit = null, shot = null, missing = null, chosen = null, projector = null }) {
-      const now = [lit, ...[shot, missing, chosen].map((set) => set && [...set].join()), projector];
+    show({ lit = null, shot = null, missing = null, chosen = null, doubt = null, projector = null }) {
+      const now = [lit, ...[shot, missing, chosen, doubt].map((set) => set && [...set].join()), projector];
       const same = now.map((x, i) => x === before[i]);
       before = now;
       if (!same[0]) {
@@ -68,12 +68,13 @@ export function dome(rig, { onpick = null, label = "" } = {}) {
           if (!over.parentNode) element.append(over);
         } else over.remove();
       }
-      if (!same[4]) for (const [name, made] of projectors) made.classList.toggle("on", projector === "all" || projector === name);
-      if (same[1] && same[2] && same[3]) return;
+      if (!same[5]) for (const [name, made] of projectors) made.classList.toggle("on", projector === "all" || projector === name);
+      if (same[1] && same[2] && same[3] && same[4]) return;
       for (const [name, spot] of lights) {
         spot.classList.toggle("shot", shot?.has(name) ?? false);
         spot.classList.toggle("lacks", missing?.has(name) ?? false);
         spot.classList.toggle("chosen", chosen?.has(name) ?? false);
+        spot.classList.toggle("doubt", doubt?.has(name) ?? false);
       }
     },
   };

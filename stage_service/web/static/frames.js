@@ -1,7 +1,7 @@
 // Captures and their frames: by camera, by light, and as a film.
 
 import { attempt, notice } from "./acts.js";
-import { ask, get } from "./ask.js";
+import { ask, captureAt, get } from "./ask.js";
 import { button, clock, h, keyed, number, say, seconds } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, events } from "./state.js";
@@ -52,7 +52,7 @@ export function open(view, [asked]) {
   function choose(id) {
     shown?.stop();
     shown = { id, ...captureOf(detail, id) };
-    history.replaceState(null, "", `#frames/${id}`);
+    history.replaceState(null, "", `#frames/${encodeURIComponent(id)}`);
     mark();
   }
 
@@ -96,7 +96,7 @@ function captureOf(view, id) {
   async function load() {
     try {
       const more = { signal: controller.signal };
-      [status, steps] = await Promise.all([get(`/captures/${id}`, more), get(`/captures/${id}/steps`, more)]);
+      [status, steps] = await Promise.all([get(captureAt(id), more), get(`${captureAt(id)}/steps`, more)]);
     } catch (error) {
       if (!controller.signal.aborted) say(facts, h("p.bad", error.message));
       return;
@@ -112,8 +112,8 @@ function captureOf(view, id) {
     facts.replaceChildren(...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
     if (c.error) facts.append(h("div", h("dt", "Error"), h("dd.bad", c.error)));
     acts.replaceChildren(
-      h("a.button", { href: `/captures/${id}/archive.tar`, download: "" }, "Download"),
-      button("Read again and verify", () => attempt(async () => { await ask(`POST /captures/${id}/verify`); notice("it is read again"); })),
+      h("a.button", { href: `${captureAt(id)}/archive.tar`, download: "" }, "Download"),
+      button("Read again and verify", () => attempt(async () => { await ask(`POST ${captureAt(id)}/verify`); notice("Every file of the capture is read again."); })),
       c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Its job") : "",
     );
   }
@@ -155,7 +155,7 @@ function captureOf(view, id) {
     say(where, `${words(step)} · step ${step.index}${step.exposure ? ` · ${seconds(step.exposure)}` : ""}`);
     slider.setAttribute("aria-valuetext", words(step));
     if (same.checked && white === null) await exposure();
-    shown.show((camera) => `/captures/${id}/frames/${step.index}/${camera}`, {
+    shown.show((camera) => `${captureAt(id)}/frames/${step.index}/${encodeURIComponent(camera)}`, {
       words: words(step), lacks: step.lacks, figures: figures.checked,
       query: [marked.checked ? "mark=true" : "", same.checked && white ? `white=${white}` : ""].filter(Boolean),
     });
@@ -165,7 +165,7 @@ function captureOf(view, id) {
   async function exposure() {
     white = 0;
     const some = [0.1, 0.3, 0.5, 0.7, 0.9].map((at) => chosen[Math.floor(at * chosen.length)]);
-    const found = await Promise.all(some.map((s) => get(`/captures/${id}/frames/${s.index}/${S.rig.cameras[0].name}.json`, { signal: controller.signal }).catch(() => null)));
+    const found = await Promise.all(some.map((s) => get(`${captureAt(id)}/frames/${s.index}/${encodeURIComponent(S.rig.cameras[0].name)}.json`, { signal: controller.signal, yields: true }).catch(() => null)));
     white = Math.max(0, ...found.filter(Boolean).map((f) => f.white));
   }
 

@@ -1,47 +1,71 @@
-// What is known of the lamps, in this console's words: none that claims more than was read back.
+// What is known of the lamps, in this console's words: none that claims more than was read back, or longer ago than is shown.
+
+import { S, silence } from "./state.js";
 
 const UNKNOWN = {
-  bar: "unknown", tone: "bad", headline: "Not known to be dark", lit: "nobody knows what is lit", fact: "unknown, unsafe",
+  bar: "unknown", tone: "bad", headline: "Not known to be dark", lit: "not known what is lit", fact: "unknown, unsafe",
 };
 const WORDS = {
   latched: { ...UNKNOWN, bar: "unsafe", headline: "UNSAFE" },
   dark: { bar: "dark", tone: "calm", headline: "Dark, verified", lit: "nothing is lit", fact: "dark, verified" },
+  doubted: { bar: "reported dark", tone: "warn", headline: "Reported dark", lit: "the light bank reports no lamp lit", fact: "reported dark" },
   said: {
     bar: "said to be dark", tone: "warn", headline: "Said to be dark", lit: "nothing is lit, says who has looked", fact: "said to be dark",
   },
   accepted: {
-    bar: "off was sent", tone: "warn", headline: "Off was sent, not read back", lit: "off was sent; the light bank cannot say what is lit",
+    bar: "off was sent", tone: "warn", headline: "Off was sent, not read back", lit: "off was sent; the light bank cannot report what is lit",
     fact: "off was sent, not read back",
   },
   use: { ...UNKNOWN, fact: "in use" },
   unknown: UNKNOWN,
 };
 
-/** Which of these `GET /health` tells: dark (read back), said (somebody looked), accepted (sent to a bank that
- * cannot read back), use (a capture has them), latched (a blackout failed), unknown. */
+/** The capture in which the light bank's read-back contradicted a command, where it is the last one. */
+export function contradicted() {
+  return S.capture?.error?.includes("read-back contradicts the command") ? S.capture.id : null;
+}
+
+/** Which of these `GET /health` has: dark (read back), doubted (read back by a bank whose read-back contradicted a
+ * command in the last capture), said (somebody looked), accepted (sent to a bank that cannot read back), use (a capture has them),
+ * latched (a blackout failed), unknown. */
 export function lampState(health) {
   if (health?.latch) return "latched";
   if (health?.lamps_accepted) return "accepted";
-  return { dark: "dark", "said to be dark": "said", "in use": "use" }[health?.lamps] ?? "unknown";
+  const state = { dark: "dark", "said to be dark": "said", "in use": "use" }[health?.lamps] ?? "unknown";
+  return state === "dark" && contradicted() ? "doubted" : state;
 }
 
 /** `bar`, `headline`, `lit` and `fact` are named for their places, `tone` is a class. `detail` is how it is
- * known; `alarm` is what has to be seen, in two parts, where no latch says it. */
+ * known; `alarm`, in two parts, is what has to be read where no latch stands for it. */
 export function lampWords(health) {
   const state = lampState(health);
   const detail = (health?.lamps_detail ?? "").replace(/^unknown, unsafe: /, "").replace(/([^.])$/, "$1.");
-  return { ...WORDS[state], state, detail, alarm: alarm(state, health && detail) };
+  const known = { ...WORDS[state], state, detail, alarm: alarm(state, health && detail) };
+  const silent = silence();
+  if (!silent) return known;
+  return {
+    ...known, bar: "no answer", tone: "bad", headline: `No answer since ${silent.clock}`, lit: "not known what is lit",
+    fact: `not known; at ${silent.clock}: ${known.fact}`,
+  };
 }
 
 function alarm(state, detail) {
-  if (state === "accepted") return ["Off was sent, and nothing says that the lamps are off. ", `${detail} No blackout finds out: look before anybody goes in.`];
-  if (state === "unknown" && detail) return ["Nobody knows whether the lamps are off. ", `${detail} A blackout (F9) sends off, and reads it back where that can be.`];
+  if (state === "accepted") return ["Off was sent, but the light bank cannot report whether the lamps are off. ", `${detail} A blackout cannot find out: look before anybody goes in.`];
+  if (state === "doubted") return ["Reported dark by a light bank whose read-back contradicted a command. ", `In capture ${contradicted()} it reported lamps as off that were commanded on. Look before anybody goes in.`];
+  if (state === "unknown" && detail) return ["It is not known whether the lamps are off. ", `${detail} A blackout (F9) sends off, and reads it back where the device can.`];
   return null;
 }
 
-/** What a device that can be left on, `kind`, is to be doubted for though it answers; null: nothing. */
+/** Why a device of this `kind`, which can be left on, is in doubt though it answers; null: it is not. */
 export function doubt(health, kind) {
   const state = lampState(health);
   if (state === "latched" || state === "unknown") return health ? "but unsafe" : null;
-  return state === "accepted" && kind === "lights" ? "but cannot say whether its lamps are off" : null;
+  if (state === "doubted" && kind === "lights") return "but its read-back contradicted a command";
+  return state === "accepted" && kind === "lights" ? "but cannot report whether its lamps are off" : null;
+}
+
+/** The lights that an unsafe stage's message names: those that may still be lit. */
+export function suspects() {
+  const named = new Set((S.health?.latch?.detail ?? "").match(/[\w.-]+/g));
+  return new Set((S.rig?.lights ?? []).map((light) => light.name).filter((name) => named.has(name)));
 }

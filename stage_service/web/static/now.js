@@ -1,22 +1,24 @@
 // The stage as it is: the light that is lit, how far the capture is, and how it stands with darkness.
 
 import { left, steering } from "./acts.js";
-import { ask, get } from "./ask.js";
+import { ask, captureAt, get } from "./ask.js";
 import { bytes, clock, h, keyed, number, say, seconds } from "./dom.js";
 import { dome } from "./dome.js";
-import { lampWords } from "./lamps.js";
-import { S, busy, load } from "./state.js";
+import { lampWords, suspects } from "./lamps.js";
+import { S, busy, load, silence, unlit } from "./state.js";
 
 const SAID = {
   idle: "The capture is about to begin.",
   running: "",
-  pausing: "It pauses at the end of this step, and puts the lights off.",
+  pausing: "The capture pauses at the end of this step and puts the lamps off.",
   paused: "Paused. Lamps and projectors were put off.",
-  aborting: "Aborting: it stops at the end of this step. Blackout (F9) does not wait.",
-  finishing: "Lights are put off; the last frames are written.",
+  aborting: "The capture stops at the end of this step. Blackout (F9) does not wait.",
+  finishing: "Lamps are put off; the last frames are written.",
 };
 
-const SLOW_MS = 1000; // a step that takes longer says how many cameras it still waits for
+const HOW = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" };
+const HEADLINES = { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" };
+const SLOW_MS = 1000; // a step that takes longer shows how many cameras have answered
 
 export function open(view) {
   const picture = dome(S.rig, { label: "the dome from above, with the light that is lit" });
@@ -29,16 +31,17 @@ export function open(view) {
   const byCamera = h("section", h("h2", "Frames by camera"), cameras);
   const missing = h("ul.missing");
   const pause = steering("Pause", () => steer("pause"), { ready: () => S.capture?.state === "running" && !S.capture.progress?.by_box });
-  const resume = steering("Resume", () => steer("resume"), { kind: "go", ready: () => ["paused", "pausing"].includes(S.capture?.state) });
-  const finish = steering("Shoot what is missing", () => steer("resume"), { ready: () => S.capture?.state === "done" && !["completed", "damaged"].includes(S.capture?.outcome) });
-  const goOn = steering("Go on with the queue", () => ask("POST /queue:go-on"), { ready: () => S.queue.held !== null });
+  const resume = steering("Resume", () => steer("resume"), { kind: "go", lights: true, ready: () => ["paused", "pausing"].includes(S.capture?.state) });
+  const finish = steering("Shoot what is missing", () => steer("resume"), { lights: true, ready: () => S.capture?.state === "done" && !["completed", "damaged"].includes(S.capture?.outcome) });
+  const fresh = h("a.button", { href: "#plan" }, "New capture");
+  const goOn = steering("Go on with the queue", () => ask("POST /queue:go-on"), { lights: true, ready: () => S.queue.held !== null });
   const line = h("ol.queue");
   const queueSaid = h("p.quiet");
   view.append(h(".now",
     h("section.stagepicture", { "aria-label": "dome" }, picture.element, lit,
-      h("p.key", h("span.k.todo", "to come"), h("span.k.done", "shot"), h("span.k.gone", "frames missing"), h("span.k.on", "lit"), h("span.k.eye", "camera"), h("span.k.beam", "projector"))),
+      h("p.key", h("span.k.todo", "to come"), h("span.k.done", "shot"), h("span.k.gone", "frames missing"), h("span.k.on", "lit"), h("span.k.maybe", "may be lit"), h("span.k.eye", "camera"), h("span.k.beam", "projector"))),
     h("section.course", { "aria-label": "capture" }, word, said, meter,
-      h(".line", pause.element, resume.element, finish.element, h("a.button", { href: "#plan" }, "New capture")),
+      h(".line", pause.element, resume.element, finish.element, fresh),
       facts,
       h(".two", byCamera, h("section", h("h2", "Shot again or missing"), missing)),
       h("section", h("h2", "Queue"), queueSaid, line, goOn.element)),
@@ -51,7 +54,7 @@ export function open(view) {
   const lacking = () => new Set((steps ?? []).filter((s) => (stepsAtEnd && !busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
 
   async function steer(action) {
-    await ask(`POST /captures/${S.capture.id}/${action}`, action === "resume" ? {} : undefined);
+    await ask(`POST ${captureAt(S.capture.id)}/${action}`, action === "resume" ? {} : undefined);
     await load.capture(S.capture.id);
   }
 
@@ -60,22 +63,23 @@ export function open(view) {
     for (const part of [pause, resume, finish, goOn]) part.update();
     pause.element.hidden = !busy() || ["paused", "pausing"].includes(c?.state);
     resume.element.hidden = !["paused", "pausing"].includes(c?.state);
-    finish.element.hidden = busy() || !c || ["completed", "damaged"].includes(c.outcome);
+    finish.element.hidden = busy() || !c || ["completed", "damaged"].includes(c.outcome) || unlit() !== null;
+    fresh.hidden = unlit() !== null;
     goOn.element.hidden = S.queue.held === null;
     queueOf();
     if (!c) {
-      say(word, lampWords(S.health).headline);
+      headlineOfLamps();
       say(said, "No capture has been made here yet.");
       meter.hidden = true;
       tell([lamps(), disk()]);
-      picture.show({});
+      picture.show({ doubt: suspects() });
       return;
     }
     const of = `${c.id} ${busy()}`; // once more at its end: then it is known what each step lacks
     if (stepsOf !== of && S.connected) {
       stepsOf = of;
       if (steps?.of !== c.id) steps = null;
-      get(`/captures/${c.id}/steps`).then((list) => { if (stepsOf === of) { steps = list; steps.of = c.id; stepsAtEnd = !busy(); update(); } }).catch(() => { stepsOf = null; });
+      get(`${captureAt(c.id)}/steps`).then((list) => { if (stepsOf === of) { steps = list; steps.of = c.id; stepsAtEnd = !busy(); update(); } }).catch(() => { stepsOf = null; });
     }
     headline(c);
     meter.hidden = false;
@@ -84,10 +88,10 @@ export function open(view) {
     const p = c.progress;
     const frames = p ? Object.values(p.frames).reduce((a, b) => a + b, 0) : c.frames_written;
     tell([
-      ["Capture", h("a", { href: `#frames/${c.id}` }, c.id)],
+      ["Capture", h("a", { href: `#frames/${encodeURIComponent(c.id)}` }, c.id)],
       ["Steps", `${number(c.step)} of ${number(c.steps)}`],
       ["Frames", `${number(frames)} of ${number(c.frames_planned)}`],
-      busy() ? ["Time left", p?.seconds_left == null ? `not known yet (predicted ${seconds(c.seconds_predicted)} in all)` : left(c)] : ["Took", `${seconds(c.seconds)} (predicted ${seconds(c.seconds_predicted)})`],
+      busy() ? ["Time left", silence() ? "not known" : p?.seconds_left == null ? `not known yet (predicted ${seconds(c.seconds_predicted)} in all)` : left(c)] : ["Took", `${seconds(c.seconds)} (predicted ${seconds(c.seconds_predicted)})`],
       ["Shot again", number(p?.again ?? S.missing.filter((x) => x.shot_again).length)],
       ["Missing", h(c.frames_missing ? "b.bad" : "span", number(c.frames_missing))],
       ["Then", c.job ? h("a", { href: `#jobs/${c.job}` }, c.request.pipeline?.name ?? c.job) : c.request.pipeline?.name ?? "nothing follows"],
@@ -106,22 +110,27 @@ export function open(view) {
   }
 
   function headline(c) {
-    if (busy()) {
+    const silent = silence();
+    if (busy() && !silent) {
       word.className = "big";
-      say(word, { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" }[c.state]);
+      say(word, HEADLINES[c.state]);
       say(said, SAID[c.state], c.error ? h("b.bad", ` ${c.error}`) : "");
       return;
     }
+    headlineOfLamps();
+    const last = busy() ? `${HEADLINES[c.state]}, step ${number(c.step)} of ${number(c.steps)}.` : `Capture ${c.id} ${HOW[c.outcome]}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`;
+    say(said, silent ? `Last known at ${silent.clock}: ${last}` : last);
+  }
+
+  function headlineOfLamps() {
     const { headline: text, tone } = lampWords(S.health);
     word.className = `big ${tone === "calm" ? "" : tone}`;
     say(word, text);
-    const how = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" }[c.outcome];
-    say(said, `Capture ${c.id} ${how}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`);
   }
 
   function lamps() {
     const { state, fact, detail } = lampWords(S.health);
-    const kind = { latched: "b.bad", unknown: "b.bad", accepted: "b.warn" }[state] ?? "span";
+    const kind = silence() ? "b.bad" : { latched: "b.bad", unknown: "b.bad", accepted: "b.warn", doubted: "b.warn" }[state] ?? "span";
     return ["Lamps", h(kind, { title: detail }, state === "use" && S.capture?.state === "paused" ? "put off for the pause" : fact)];
   }
   function disk() {
@@ -141,18 +150,19 @@ export function open(view) {
   }
 
   function showLights(c, p) {
-    const running = ["running", "pausing", "aborting"].includes(c.state);
+    const running = ["running", "pausing", "aborting"].includes(c.state) && !silence();
     const now = running && p ? p : {};
     const shot = new Set((steps ?? []).slice(0, c.step).map((s) => s.light).filter(Boolean));
     picture.show({
       lit: now.kind === "all_on" ? "all" : now.light ?? null,
       shot, missing: lacking(),
       projector: now.kind === "tracking" ? "all" : now.projector ?? null,
+      doubt: suspects(),
     });
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
     const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have answered` : "";
-    say(lit, busy() ? what + answered : lampWords(S.health).lit);
+    say(lit, busy() && !silence() ? what + answered : lampWords(S.health).lit);
   }
 
   function waitsAt(step) {
@@ -185,9 +195,9 @@ export function open(view) {
 
   function queueOf() {
     const q = S.queue;
-    say(queueSaid, q.held ? `Held: ${q.held}. Nothing begins by itself.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "Nothing waits.");
+    say(queueSaid, q.held ? `Held: ${q.held}. No queued capture begins until somebody goes on with the queue.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "The queue is empty.");
     keyed(line, q.waiting, (x) => x.id, (x) => {
-      const go = steering("start now", () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: prompt("Who at the stage answers for the flashes?") } : undefined), { kind: "quiet" });
+      const go = steering("start now", () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: prompt("Who at the stage answers for the flashes?") } : undefined), { kind: "quiet", lights: true });
       const up = steering("first", () => ask(`PATCH /queue/${x.id}`, { place: 0 }), { kind: "quiet" });
       const at = () => S.queue.waiting.findIndex((y) => y.id === x.id);
       const place = (text, by, more) => steering(text, () => ask(`PATCH /queue/${x.id}`, { place: at() + by }), { kind: "quiet", ready: () => S.queue.waiting[at() + by] !== undefined, ...more });

@@ -1,6 +1,7 @@
 // All cameras side by side: a frame of each, how it is exposed, and what is drawn over it.
 
-import { get } from "./ask.js";
+import { get, service } from "./ask.js";
+import { pressed } from "./blackout.js";
 import { h, number, percent, say, svg } from "./dom.js";
 import { S } from "./state.js";
 
@@ -9,6 +10,8 @@ import { S } from "./state.js";
  * what is drawn on top: `over(camera)`, SVG in pixels. A slow frame is left out for the newest. */
 export function pictures(grid, signal) {
   const cells = new Map();
+  service.addEventListener("yield", () => { for (const cell of cells.values()) cell.drop(); }, { signal });
+  service.addEventListener("yielded", () => { for (const cell of cells.values()) if (cell.dropped) cell.show(() => cell.next.path, cell.next.more); }, { signal });
   grid.style.setProperty("--cell", S.rig.cameras.length > 12 ? "10rem" : "14rem");
 
   function cellOf(camera) {
@@ -20,13 +23,27 @@ export function pictures(grid, signal) {
     const drawn = svg("svg", { class: "over", viewBox: `-.5 -.5 ${width} ${height}`, "aria-hidden": "true" });
     const figure = h(`figure${width < 320 ? ".pixels" : ""}`, h(".shown", image, drawn), text);
     grid.append(figure);
-    const cell = { busy: false, next: null, show };
+    const cell = { busy: false, next: null, dropped: false, show, drop };
     cells.set(name, cell);
     return cell;
 
+    /** End the download under way, until "yielded". */
+    function drop() {
+      if (!cell.busy) return;
+      cell.dropped = true;
+      cell.busy = false;
+      image.onload = image.onerror = null;
+      image.removeAttribute("src");
+    }
+
     function show(path, more) {
+      cell.dropped = false;
       const next = { path: path(name), more };
       cell.next = next;
+      if (pressed?.going) {
+        cell.dropped = true;
+        return;
+      }
       if (more.lacks?.includes(name)) {
         image.removeAttribute("src");
         cell.busy = false; // of what was on its way nothing more is heard
@@ -49,7 +66,7 @@ export function pictures(grid, signal) {
     }
 
     async function tell(next) {
-      const f = await get(`${next.path}.json`, { signal }).catch(() => null);
+      const f = await get(`${next.path}.json`, { signal, yields: true }).catch(() => null);
       if (!f || cell.next !== next) return;
       const top = Math.log1p(Math.max(...f.histogram));
       plot.replaceChildren(...f.histogram.map((n, i) => svg("path", { class: i === 63 && f.saturated ? "full" : "", d: `M${i} 20V${(20 - (19 * Math.log1p(n)) / (top || 1)).toFixed(2)}h.9V20z` })));

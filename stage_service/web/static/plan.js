@@ -28,7 +28,7 @@ export function open(view) {
   let timer = 0;
   const picker = dome(S.rig, { label: "lights to shoot: click to choose", onpick: pick });
   const then = thenFields();
-  const start = steering("Start now", begin, { kind: "go", ready: () => cost !== null && !busy() });
+  const start = steering("Start now", begin, { kind: "go", lights: true, ready: () => cost !== null && !busy() });
   const queue = steering("Put into the queue", enqueue, { ready: () => cost !== null });
 
   get("/openapi.json").then((api) => {

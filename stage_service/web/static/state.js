@@ -1,11 +1,16 @@
 // What the page knows of the service: asked for once, then kept by events.
 
-import { ask, get, own } from "./ask.js";
+import { ask, captureAt, get, own, service } from "./ask.js";
+import { keepRight, pressed } from "./blackout.js";
+import { clock, local } from "./dom.js";
 import { follow } from "./stream.js";
 
 export const S = {
-  connected: null, // null: not yet; false: since `lostAt`
-  lostAt: null,
+  out: false, // nobody is logged in: nothing is known, and nothing is requested
+  connected: null, // null: not yet; false: events and answers have stopped
+  heardAt: null, // when the service last sent anything (ms)
+  polling: null, // why the service refuses events to this page, which then asks every second
+  problem: null, // why what the page needs first has not been answered
   who: null,
   rig: null,
   health: null,
@@ -48,13 +53,46 @@ export function changed(calm = false) {
 
 export const events = new EventTarget(); // each of the service's, by its kind
 
+const SILENT_S = 2.5; // a service sends something every 1 to 1.5 s
+const LONGEST_S = 1.5;
+
+service.addEventListener("word", () => { S.heardAt = Date.now(); });
+
+/** Since when nothing has come from the service: {since, clock, seconds}; null: it was heard just now. */
+export function silence() {
+  if (S.out || S.heardAt === null) return null;
+  const seconds = Math.max(0, (Date.now() - S.heardAt) / 1000);
+  if (S.connected !== false && seconds < SILENT_S) return null;
+  return { since: S.heardAt, clock: clock(S.heardAt), seconds: Math.floor(seconds) };
+}
+
+/** Seconds after the service's last heartbeat at which the light bank puts its lamps off by itself, as this page
+ * last read it; null: it has no watchdog; undefined: this browser has never read it. */
+export function watchdogSeconds() {
+  const kept = localStorage.getItem("watchdog_s");
+  return S.rig?.watchdog_s !== undefined ? S.rig.watchdog_s : kept === null ? undefined : JSON.parse(kept);
+}
+
+/** What a light bank's watchdog does about a service that has stopped, with its seconds. */
+export function watchdogSentence(silent = null) {
+  const s = watchdogSeconds();
+  if (s === undefined) return "If the service has stopped, the light bank's watchdog puts the lamps off, where the bank has one.";
+  if (s === null) return "This light bank has no watchdog: lamps that are lit stay lit.";
+  const rule = `the light bank's watchdog puts the lamps off ${s} s after the service's last heartbeat`;
+  if (!silent) return `If the service has stopped, ${rule}.`;
+  return `If the service has stopped, ${rule}: by ${clock(silent.since + 1000 * (s + LONGEST_S))}.`;
+}
+
 export const busy = () => S.capture !== null && S.capture.state !== "done";
 export const mine = () => own.lease !== null && S.lease.holder !== null && own.lease.holder === S.lease.holder;
+/** Why no lamp may be lit now; null: one may. */
+export const unlit = () => (S.health?.latch ? "UNSAFE: no lamp may be lit before a blackout is read back dark" : null);
+
 /** Why this page may not steer now; null: it may. */
 export function refused() {
-  if (S.connected === false) return "no connection to the service";
-  if (S.who && !S.who.scopes.includes("steer")) return "your token does not open steering";
-  if (S.lease.holder !== null && !mine()) return `${S.lease.holder} steers the stage until ${new Date(S.lease.expires).toLocaleTimeString("en-GB")}`;
+  if (silence()) return "the service does not answer";
+  if (S.who && !S.who.scopes.includes("steer")) return "your token lacks the scope steer";
+  if (S.lease.holder !== null && !mine()) return `${S.lease.holder} steers the stage until ${clock(S.lease.expires)}`;
   return null;
 }
 
@@ -84,13 +122,19 @@ async function fresh(name, path, take) {
 const SNAPSHOT = "snapshot"; // it is no capture but while it is taken
 
 export const load = {
-  rig: () => fresh("rig", "/rig", (x) => { S.rig = x; }),
-  health: () => fresh("health", "/health", (x) => { S.health = x; }),
+  rig: () => fresh("rig", "/rig", (x) => {
+    S.rig = x;
+    localStorage.setItem("watchdog_s", JSON.stringify(x.watchdog_s ?? null));
+  }),
+  health: () => fresh("health", "/health", (x) => {
+    const latch = x.latch && { ...x.latch, detail: local(x.latch.detail) };
+    S.health = { ...x, latch, lamps_detail: local(x.lamps_detail), problems: x.problems.map(local) };
+  }),
   lease: () => fresh("lease", "/lease", (x) => { S.lease = x; }),
-  queue: () => fresh("queue", "/queue", (x) => { S.queue = x; }),
+  queue: () => fresh("queue", "/queue", (x) => { S.queue = { ...x, held: x.held && local(x.held), waits_for: x.waits_for && local(x.waits_for) }; }),
   jobs: () => fresh("jobs", "/jobs?limit=100", (x) => { S.jobs = x; S.jobsProblem = null; })
     .catch((error) => { S.jobsProblem = error.message; changed(); }),
-  capture: (id) => fresh(`capture ${id}`, `/captures/${id}`, takeCapture),
+  capture: (id) => fresh(`capture ${id}`, captureAt(id), takeCapture),
   /** The capture that runs, which need not be the newest, else that. */
   now: async () => {
     await load.health();
@@ -100,7 +144,8 @@ export const load = {
   },
 };
 
-function takeCapture(status) {
+function takeCapture(found) {
+  const status = found.error ? { ...found, error: local(found.error) } : found;
   if (status.id === SNAPSHOT && status.state === "done") {
     if (S.capture?.id === SNAPSHOT) load.now().catch(() => {});
     return;
@@ -178,6 +223,7 @@ function heard(kind, data) {
 }
 
 let line = 0; // which of the lines to the service is the one that holds, or was lost last
+const down = () => { line++; S.connected = false; changed(); };
 
 /** Ask for everything: at the start, and whenever the line was lost. */
 async function all(mine) {
@@ -189,8 +235,27 @@ async function all(mine) {
   await keepLease();
   if (mine !== line) return;
   S.connected = true;
+  S.polling = S.problem = null;
   changed();
   events.dispatchEvent(new Event("fresh"));
+}
+
+/** Where the service refuses events, `why`: ask for what they would have told. */
+async function poll(why) {
+  const mine = ++line;
+  const shown = () => JSON.stringify([S.connected, S.capture?.id, S.capture?.state, S.capture?.outcome]);
+  const before = shown();
+  try {
+    await Promise.all([load.lease(), load.queue(), load.now(), S.rig ? null : load.rig(), S.jobs ? null : load.jobs()]);
+  } catch (error) {
+    S.problem = error.message;
+    if (mine === line && error.status !== 401) down();
+    return;
+  }
+  if (mine !== line) return;
+  Object.assign(S, { connected: true, polling: why, problem: null });
+  changed();
+  if (shown() !== before) events.dispatchEvent(new Event("fresh"));
 }
 
 /** Ask until all is answered: one lost question does not end the line, which would have it asked again. */
@@ -201,6 +266,8 @@ async function up() {
       return await all(mine);
     } catch (error) {
       if (error.status === 401) return undefined;
+      S.problem = error.message;
+      changed();
       await new Promise((later) => setTimeout(later, AGAIN_MS));
     }
   }
@@ -210,19 +277,17 @@ async function up() {
 /** Begin; raises where nobody is logged in. */
 export async function begin() {
   S.who = await get("/login");
-  const followed = follow({
-    event: heard,
-    up,
-    down: () => {
-      line++;
-      if (S.connected !== false) S.lostAt = new Date().toISOString();
-      S.connected = false;
-      changed();
-    },
-  });
-  setInterval(() => { if (S.connected && !document.hidden) load.health().catch(() => {}); }, 30_000); // the disk
-  return followed;
+  keepRight(S.who);
+  follow({ event: heard, up, down, refused: poll });
+  setInterval(() => { if (S.connected && !S.out && !document.hidden) load.health().catch(() => {}); }, 30_000); // the disk
 }
+
+let aged = false;
+setInterval(() => { // what is drawn from the time since something happened
+  const ages = silence() !== null || Boolean(pressed?.going);
+  if (ages || aged) changed();
+  aged = ages;
+}, CALM_MS);
 
 // The lease, for as long as a page holds it.
 const LEASE_S = 150;
@@ -251,13 +316,13 @@ async function keepLease() {
     own.lease = await ask("PATCH /lease", { seconds: LEASE_S });
     S.lease = { holder: own.lease.holder, expires: own.lease.expires };
   } catch (error) {
-    if (error.status) own.lease = null; // it is over; where nobody answers it may not be
+    if (error.kind === "no-lease") own.lease = null;
     await load.lease().catch(() => {});
   }
   changed();
 }
 
-setInterval(() => { if (own.lease && S.connected) keepLease(); }, 50_000);
-setInterval(() => { // one that ran out is told by nobody
-  if (S.lease.expires && new Date(S.lease.expires) < new Date()) load.lease().catch(() => {});
+setInterval(() => { if (own.lease && S.connected && !S.out) keepLease(); }, 50_000);
+setInterval(() => { // no event says that one has run out
+  if (!S.out && S.lease.expires && new Date(S.lease.expires) < new Date()) load.lease().catch(() => {});
 }, 5_000);

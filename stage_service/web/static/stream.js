@@ -1,55 +1,60 @@
 // The service's events, for as long as the page is open: over dead networks and restarts.
 //
-// `fetch` instead of `EventSource`: it tells what status a refusal had, and what the service sends to
-// keep the line alive, so that a line that is dead and does not say so is noticed.
+// `fetch` instead of `EventSource`: it has the status of a refusal, and the comments that the service sends
+// every second, so that a line that is dead without having ended is noticed.
 
-import { login } from "./ask.js";
+import { service, tell } from "./ask.js";
 
-const SILENCE_MS = 22_000; // the service says something every 15 s
+const SILENCE_MS = 8000;
 const PAUSES_MS = [500, 1000, 2000, 4000];
+const REFUSED_MS = 1000;
 
-/** Follow the events; `on.event(kind, data)`, `on.up()` when a line is new, `on.down()` when it is lost. */
+/** Follow the events: `on.event(kind, data)`, `on.up()` when a line is new, `on.down()` when it is lost,
+ * `await on.refused(why)` every second while the service refuses one. */
 export function follow(on) {
-  let stop = null;
+  let stop = null; // ends the line; not null while there is one, or one is tried
   let tries = 0;
   let waiting = 0;
 
-  async function line() {
-    const abort = new AbortController();
-    stop = abort;
+  async function line(abort) {
     let silence = setTimeout(() => abort.abort(), SILENCE_MS);
     const heard = () => {
       clearTimeout(silence);
       silence = setTimeout(() => abort.abort(), SILENCE_MS);
+      tell("word");
     };
     try {
       const answer = await fetch("/events", { signal: abort.signal, cache: "no-store", credentials: "same-origin" });
       if (answer.status === 401) {
-        login.dispatchEvent(new Event("over"));
-        return "over";
+        tell("over");
+        return { over: true };
       }
-      if (!answer.ok) throw new Error(`events: HTTP ${answer.status}`);
+      if (!answer.ok) {
+        const { detail } = await answer.json().catch(() => ({}));
+        return { refused: detail ?? `HTTP ${answer.status}` };
+      }
       tries = 0;
+      heard();
       on.up();
       const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
       let rest = "";
       for (;;) {
         const { value, done } = await reader.read();
-        if (done) return "lost";
+        if (done) return {};
         heard();
         const blocks = (rest + value.replaceAll("\r\n", "\n")).split("\n\n");
         rest = blocks.pop();
-        for (const block of blocks) tell(block);
+        for (const block of blocks) read(block);
       }
     } catch {
-      return "lost";
+      return {};
     } finally {
       clearTimeout(silence);
       abort.abort();
     }
   }
 
-  function tell(block) {
+  function read(block) {
     const data = block.split("\n").filter((x) => x.startsWith("data:")).map((x) => x.slice(5)).join("\n");
     if (!data) return;
     const event = JSON.parse(data);
@@ -58,12 +63,13 @@ export function follow(on) {
 
   async function go() {
     if (stop) return;
-    const ended = await line();
+    stop = new AbortController();
+    const ended = await line(stop);
+    if (ended.refused) await on.refused(ended.refused);
+    else if (!ended.over) on.down();
     stop = null;
-    if (ended === "over") return;
-    on.down();
-    if (document.hidden) return;
-    waiting = setTimeout(go, PAUSES_MS[Math.min(tries++, PAUSES_MS.length - 1)]);
+    if (ended.over || document.hidden) return;
+    waiting = setTimeout(go, ended.refused ? REFUSED_MS : PAUSES_MS[Math.min(tries++, PAUSES_MS.length - 1)]);
   }
 
   // A browser keeps few connections to one host: a page that nobody sees gives its own back.
@@ -75,6 +81,6 @@ export function follow(on) {
     }
   });
   addEventListener("online", () => { clearTimeout(waiting); go(); });
+  service.addEventListener("yield all", () => stop?.abort());
   go();
-  return { again: go };
 }

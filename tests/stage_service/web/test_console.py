@@ -218,25 +218,27 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     says(page, "Off was sent, not read back")
     http.post("/captures", json={"plan": {**PACED, "lights": ["light_003"]}})
     until(lambda: http.service.captures(1)[0].state == "done")
-    sent = "off was sent; the light bank cannot say what is lit"
+    sent = "off was sent; the light bank cannot report what is lit"
     alarm = told("Off was sent, not read back", "off was sent", sent)
-    assert "nothing says that the lamps are off" in alarm
-    assert "No blackout finds out: look before anybody goes in." in alarm
+    assert "the light bank cannot report whether the lamps are off" in alarm
+    assert "A blackout cannot find out: look before anybody goes in." in alarm
     page.click("nav >> text=Stage")
-    page.wait_for_selector(".device:has-text('answers, but cannot say whether its lamps are off')")
+    page.wait_for_selector(
+        ".device:has-text('answers, but cannot report whether its lamps are off')"
+    )
     assert "safe" not in page.text_content("#view .grid")
     page.click("nav >> text=Now")
 
     stage = http.service._captures.stage
     stage.learn(Blackout(False, "unknown, unsafe: lights: no answer."))
-    alarm = told("UNSAFE", "unsafe", "nobody knows what is lit")
-    assert "This light bank cannot say whether its lamps are off" in alarm
+    alarm = told("UNSAFE", "unsafe", "not known what is lit")
+    assert "This light bank cannot report whether its lamps are off" in alarm
     page.fill("[name=name]", "Ada")
     page.fill("[name=note]", "all dark")
     page.click("text=I looked")
     assert not told("Said to be dark", "said to be dark", "nothing is lit, says who has looked")
     page.keyboard.press("F9")
-    assert "No blackout finds out" in told("Off was sent, not read back", "off was sent", sent)
+    assert "A blackout cannot find out" in told("Off was sent, not read back", "off was sent", sent)
 
 
 def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
@@ -299,7 +301,7 @@ def test_a_service_that_is_started_again_is_found_by_the_open_page(simulated, br
         page = pages.open()
         says(page, "Dark, verified")
         before = page.evaluate("performance.timeOrigin")
-    page.wait_for_selector(".alarm:has-text('No connection to the service')")
+    page.wait_for_selector(".alarm:has-text('No answer from the service')")
     with serving(rig_file, tmp_path / "root", port=port) as http:
         page.wait_for_selector(".alarm", state="detached")
         http.post("/captures", json={"plan": PACED}).raise_for_status()
@@ -441,7 +443,7 @@ def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
         page.click("button:text-is('Pause')")
         says(page, "Paused")
         world.deaf_lights = True
-        page.wait_for_selector(".said b.bad:has-text('Mend it first')")
+        page.wait_for_selector(".said b.bad:has-text('Remove the cause first')")
         assert "light bank" in http.get(f"/captures/{id_}").json()["error"]
         world.deaf_lights = False
         page.wait_for_selector(".said b.bad", state="detached")

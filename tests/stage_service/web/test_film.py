@@ -305,7 +305,7 @@ def test_what_has_gone_wrong_as_a_film(hold, simulated, browser, film, demo_rig,
         page.wait_for_selector(".cost .facts")
         film.take(page, "another_steers", brightest=2 * BRIGHTEST)
         assert pages.complaints == []
-    page.wait_for_selector("text=No connection to the service")
+    page.wait_for_selector("text=No answer from the service")
     film.take(page, "no_connection", brightest=2 * BRIGHTEST)
     pages.close()
     assert film.wrong == [], "\n".join(film.wrong)

@@ -1,0 +1,105 @@
+// What has to be read, above every view: it stays until its cause has gone.
+
+import { attempt } from "./acts.js";
+import { ask } from "./ask.js";
+import { dismiss, pressed, right } from "./blackout.js";
+import { button, clock, h, keyed, say } from "./dom.js";
+import { lampWords } from "./lamps.js";
+import { S, changed, load, silence, watchdogSentence } from "./state.js";
+
+const STOP = "Press the wired emergency stop.";
+const UNANSWERED_MS = 1500; // a service that answers has done so by then
+
+/** Keeps `box` as it should be; call the function that this returns after each change. */
+export function alarmBox(box) {
+  return () => keyed(box, [refusal(), unanswered(), answer(), loggedOut(), silent(), polling(), ...(S.out ? [] : stage())].filter(Boolean), (x) => x.key, (x) => x.make());
+}
+
+/** An alarm; the elapsed seconds are drawn and not read out, which would be once a second. */
+function alarm(kind, strong, ...rest) {
+  const key = [kind, strong, ...rest.map((x) => x.textContent ?? x)].join("|");
+  return { key, make: () => ({ element: h(`.alarm${kind}`, h("strong", strong, " "), rest) }) };
+}
+
+function counting(kind, strong, seconds, ...rest) {
+  const key = [kind, strong, ...rest.map((x) => x.textContent ?? x)].join("|");
+  return { key, seconds, make: () => {
+    const count = h("span.n", { "aria-hidden": "true" });
+    return { element: h(`.alarm${kind}`, h("strong", strong, " "), count, " ", rest), tell: (x) => say(count, `${x.seconds()} s.`) };
+  } };
+}
+
+const ago = (ms) => Math.floor((Date.now() - ms) / 1000);
+
+function refusal() {
+  const why = pressed?.refused;
+  if (!why) return null;
+  const login = why.kind === "unauthorized";
+  return alarm("", login ? "Log in again. The stage was NOT darkened: press the wired emergency stop." : "The stage was NOT darkened: press the wired emergency stop.",
+    `Blackout of ${clock(pressed.at)} was refused${login ? ": this page is not logged in, and its right to send Blackout alone is missing or no longer valid. It is sent again as soon as you log in." : `: ${why.detail}`} `,
+    button(login ? "do not send it again" : "seen", () => dismiss(), { kind: "quiet" }));
+}
+
+function unanswered() {
+  if (!pressed?.going || Date.now() - pressed.at < UNANSWERED_MS) return null;
+  return counting("", `Blackout of ${clock(pressed.at)} has not been answered for`, () => ago(pressed.at),
+    `${pressed.error ? `The service failed: ${pressed.error}. ` : ""}It is sent again until the service answers. ${STOP}`,
+    silence() ? "" : ` ${watchdogSentence()}`);
+}
+
+/** To a page without a login, which is shown nothing else of the stage. */
+function answer() {
+  if (!S.out || !pressed?.answer) return null;
+  const { at, safe, detail } = pressed.answer;
+  if (safe) return alarm(".calm", `Dark, verified at ${clock(at)},`, "by the blackout of this page. What has happened since is not shown before you log in.");
+  return alarm("", "UNSAFE: treat every lamp as lit.", `Blackout of ${clock(pressed.at)}, answered at ${clock(at)}: ${detail} ${watchdogSentence()} ${STOP}`);
+}
+
+function loggedOut() {
+  if (!S.out) return null;
+  if (right()) return alarm(".accepted", S.who ? "Your login has ended." : "You are not logged in.", "Nothing of the stage is shown. Blackout (F9) works without a login.");
+  return alarm("", "This page cannot darken the stage.", `Blackout (F9) needs a browser that has logged in here before. Log in, or press the wired emergency stop. ${watchdogSentence()}`);
+}
+
+function silent() {
+  const since = silence();
+  if (!since || document.hidden) return null;
+  return counting("", `No answer from the service since ${since.clock}:`, () => silence()?.seconds ?? 0,
+    `The stage may be lit, and what is shown is of ${since.clock}. ${watchdogSentence(since)} If only the connection is lost, lamps stay as the service commands them. The page goes on trying.`);
+}
+
+function polling() {
+  if (!S.polling) return null;
+  return alarm(".accepted", "The service refuses live events to this page.", `It answers: ${S.polling}. The page asks every second instead. Abort and Blackout work.`);
+}
+
+function stage() {
+  const { latch } = S.health ?? {};
+  const { state, alarm: lamps } = lampWords(S.health);
+  const known = latch ? unsafe(latch) : lamps ? alarm(["accepted", "doubted"].includes(state) ? ".accepted" : "", ...lamps.map((x) => x.trim())) : null;
+  return [known, S.failed ? failed(latch) : null];
+}
+
+function failed(latch) {
+  const { id, error } = S.failed;
+  return alarm("", `Capture ${id} failed.`, `${latch ? (error ?? "").split("; blackout: ")[0] : error ?? ""} `, button("seen", () => {
+    sessionStorage.setItem("seen", id);
+    S.failed = null;
+    changed();
+  }, { kind: "quiet" }));
+}
+
+function unsafe(latch) {
+  const why = () => h("p", h("strong", "UNSAFE: treat every lamp as lit."), ` Since ${clock(latch.since)}: ${latch.detail.replace(/^unknown, unsafe: /, "")}`);
+  const key = `latch|${latch.since}|${latch.detail}|${latch.ended_by}`;
+  if (latch.ended_by === "blackout") return { key, make: () => ({ element: h(".alarm.latch", why(), h("p", "Nothing is lit until a blackout reads every lamp back dark. Stay out of the stage, cut the lamps' supply, remove the cause, then press ", h("b", "Blackout"), " (F9).")) }) };
+  return { key, make: () => {
+    const name = h("input", { name: "name", required: true, minlength: 2, placeholder: "your name", "aria-label": "your name" });
+    const note = h("input", { name: "note", required: true, minlength: 4, placeholder: "what you saw", "aria-label": "what you saw" });
+    return { element: h(".alarm.latch", why(), h("p", "This light bank cannot report whether its lamps are off. Nothing is lit until somebody has looked and confirms it:"),
+      h("form.line", { onsubmit: (event) => {
+        event.preventDefault();
+        attempt(() => ask("POST /devices/acknowledge", { name: name.value, note: note.value })).then(() => load.health());
+      } }, name, note, h("button", "I looked: the lamps are off"))) };
+  } };
+}
