@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
@@ -32,6 +33,7 @@ from stage_service.plan.resolved import resolve
 from stage_service.queueing import Queueing, then
 from stage_service.records.audit import Action
 from stage_service.records.events import EventLog
+from stage_service.records.refusals import Refusals
 from stage_service.service_models import (
     AcknowledgeRequest,
     BoardQuery,
@@ -52,6 +54,8 @@ from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
+FLUSH_S = 1.0
+"""The end of the service waits for so long for the audit log's disk."""
 READ_S = 1.0
 """A start waits for so long for the captures on the disk; the others are read beside it."""
 
@@ -87,6 +91,7 @@ class Service:
             root / "models", self._control, self._queue, self._follower, self.capture_path
         )
         self.leasing = Leasing(self._control, self.events)
+        self.refusals = Refusals(self._captures.audit)
         self.watching = Watching(root, self._captures, self._queue, self._follower)
         self.storage = Storage(root, self._captures, self._control, self._queue)
         self.viewing = Viewing(lambda: [m.name for m in self.storage.models()], self._viewed)
@@ -153,6 +158,8 @@ class Service:
                 self._captures.close()
             finally:
                 self._closed.set()
+        self.refusals.close()
+        self._control.audit.flush(FLUSH_S)
         self._follower.close()
         self._queue.close()
 
@@ -369,10 +376,9 @@ class Service:
         self._control.do(by, "acknowledge", work, detail=said)
         return self._captures.safety()
 
-    def record_login(self, name: str, address: tuple[str, int] | None) -> None:
-        """Note in the audit log who logged in, and from where."""
-        where = "" if address is None else f"{address[0]}:{address[1]}"
-        self._control.audit.record(str(Caller(where, name=name)), "login", "service")
+    def record_login(self, by: Caller, action: str) -> Future[None]:
+        """Note in the audit log who logged in or out; done once that is on the disk."""
+        return self._control.audit.later(str(by), action, "service")
 
     def audit(self, limit: int) -> list[Action]:
         """The newest actions on the stage, refused ones too; the oldest of them first."""

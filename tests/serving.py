@@ -16,6 +16,7 @@ from fastapi import FastAPI
 from waiting import until
 
 from stage_service.api.app import create_app
+from stage_service.api.connections import limits
 from stage_service.api.gate import Access
 from stage_service.config import RigFile
 from stage_service.service import Service
@@ -55,7 +56,7 @@ def serving(
 @contextmanager
 def listening_app(app: FastAPI, port: int = 0) -> Iterator[str]:
     """The URL of an application on a socket of its own."""
-    config = uvicorn.Config(app, log_level="critical", ws="none", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1, **limits())
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", port))
     thread = threading.Thread(target=server.run, args=([listener],))
@@ -74,11 +75,14 @@ def slug(response: httpx.Response) -> str:
 
 
 def send(app: FastAPI, what: str, headers: dict[str, str], **more: Any) -> httpx.Response:
-    """The answer to a request like "GET /captures"; of a service that has not started."""
-    method, path = what.split(" ")
+    """The answer to a request like "GET /captures"; of a service that has not started. It comes
+    from `host`, and goes to `url`, this machine's where neither is given."""
+    method, path = what.split(" ", 1)
+    url, client = more.pop("url", URL), (more.pop("host", "127.0.0.1"), 123)
 
     async def answer() -> httpx.Response:
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=URL) as http:
+        transport = httpx.ASGITransport(app, client=client)
+        async with httpx.AsyncClient(transport=transport, base_url=url) as http:
             return await http.request(method, path, headers=headers, **more)
 
     return asyncio.run(answer())
@@ -89,3 +93,18 @@ def refused(response: httpx.Response, slug: str, status: int) -> dict[str, Any]:
     data: dict[str, Any] = response.json()
     assert (data["type"], response.status_code) == (f"/docs/errors.md#{slug}", status), data
     return data
+
+
+def routes_of(app: FastAPI) -> list[tuple[str, str]]:
+    """Method and path of every route that an application answers."""
+
+    def walk(routes: Any) -> Iterator[tuple[str, str]]:
+        for route in routes:
+            inner = getattr(route, "original_router", None)
+            if inner is not None:
+                yield from walk(inner.routes)
+                continue
+            for method in route.methods - {"HEAD"}:
+                yield method, route.path
+
+    return sorted(walk(app.routes))

@@ -31,6 +31,7 @@ from stage_service.api.downloads import Heads
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
+from stage_service.records.refusals import Refusals
 from stage_service.service import Service
 from stage_service.viewer import Viewing
 from stage_service.web import pages
@@ -79,24 +80,25 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     def errors() -> PlainTextResponse:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
-    return _completed(app, access)
+    return _completed(app, access, service.refusals)
 
 
 def create_viewer(models: Viewing, access: Access) -> FastAPI:
     """The viewer of `models` alone, without a stage."""
-    app = FastAPI(title="hairstage viewer", version=version("hairstage"))
+    number = version("hairstage")
+    app = FastAPI(title="hairstage viewer", version=number, docs_url=None, redoc_url=None)
     app.state.viewing = models
     return _completed(app, access)
 
 
-def _completed(app: FastAPI, access: Access) -> FastAPI:
+def _completed(app: FastAPI, access: Access, refusals: Refusals | None = None) -> FastAPI:
     """What every application of ours has: the viewer, problem documents, gate, safe headers."""
     install_problems(app)
-    app.include_router(viewing.page)
-    app.include_router(viewing.reading)
+    for part in (viewing.page, viewing.reading, viewing.router):
+        app.include_router(part)
     app.add_middleware(Faults)
     app.add_middleware(Heads)
-    app.add_middleware(Gate, access=access)
+    app.add_middleware(Gate, access=access, refusals=refusals)
     app.add_middleware(SafeHeaders)  # outside: what the gate refuses has them, too
     return app
 

@@ -104,6 +104,7 @@ def limits() -> dict[str, Any]:
         "http": protocol(),
         "backlog": ACCEPTED,
         "ws": "none",
+        "proxy_headers": False,  # else a client on this machine writes its own address itself
         "timeout_keep_alive": int(HEADER_S),
         "h11_max_incomplete_event_size": MOST_HEADER_BYTES,
     }

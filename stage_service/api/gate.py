@@ -15,20 +15,22 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from reconstruction.reading import parse_json
-from stage_service.api.login import LOGIN, cookies, place
-from stage_service.api.problems import PAGE, problem_response
+from stage_service.api.login import cookies, place
+from stage_service.api.problems import problem_response
+from stage_service.api.scopes import Route, route_of
 from stage_service.api.steering import RIGHT
+from stage_service.records.attempts import Attempts
 from stage_service.records.logins import Logins
+from stage_service.records.refusals import Refusals
 from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
-from stage_service.web.pages import FOLDER, PAGES
 
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 VIEW, VIEW_PAGE = "/view", "/view/page/"
-OPEN = {PAGE, "/openapi.json", VIEW, *PAGES}
-"""Says nothing of a stage: how to ask, for whoever may not yet. So do the pages' files."""
 ANYBODY = Identity(name="", scopes=SCOPES)
 DARK = ("POST", "/devices/blackout")
 """The one request that a page's right to a blackout opens."""
+NAMES = {"/devices/blackout": "blackout", "/login": "login"}
+"""What the audit log calls them, refused or not."""
 MOST_BODY = 1 << 20
 BODY_S = 20.0
 """A request's body is there within this time."""
@@ -46,6 +48,7 @@ class Access:
     tokens: Tokens | None = None
     names: frozenset[str] = OWN_NAMES
     logins: Logins = field(default_factory=Logins)
+    attempts: Attempts = field(default_factory=Attempts)
 
     def refusal(self, headers: Headers) -> tuple[str, str, int | None] | None:
         """Why a browser may have been made to send this, as a problem's kind, detail, status.
@@ -56,9 +59,10 @@ class Access:
         host = headers.get("host", "")
         if _name(host).lower() not in self.names:
             return "http", f"host {host!r} is not a name of this service", 421
-        origin = headers.get("origin")
-        if origin is not None and origin.partition("://")[2] != host:
-            return "foreign-origin", f"a page of {origin!r} may not ask this service", None
+        own = {f"{scheme}://{host}" for scheme in ("http", "https")}
+        for origin in headers.getlist("origin"):
+            if origin not in own:
+                return "foreign-origin", f"a page of {origin!r} may not ask this service", None
         return None
 
     def identity(self, headers: Headers, secure: bool = False) -> Identity | None:
@@ -90,8 +94,8 @@ class Gate:
     """Passes on what `access` lets in, with its body read; the caller is `identity` in the scope's
     state. All else is answered with a problem document."""
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app, self._access = app, access
+    def __init__(self, app: ASGIApp, access: Access, refusals: Refusals | None = None) -> None:
+        self._app, self._access, self._refusals = app, access, refusals
         self._uploads = asyncio.Semaphore(2)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -100,32 +104,68 @@ class Gate:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        refusal = self._access.refusal(headers)
-        if refusal is None:
-            identify = partial(self._access.identity, secure=scope["scheme"] == "https")
-            identity = identify(headers)
-            if identity is None and (scope["method"], scope["path"]) == DARK:
-                identity = self._access.darkens(headers)
-            state = scope.setdefault("state", {})
-            state["identity"], state["identify"] = identity, identify
-            if identity is None and not _open(scope):
-                detail = (
-                    "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown, or "
-                    "the login is over"
-                )
-                refusal = "unauthorized", detail, None
-        if refusal is None:
+        route = route_of(scope["method"], scope["path"])
+        darkens = route is not None and (route.method, route.path) == DARK
+        state = scope.setdefault("state", {})
+        refusal = self._access.refusal(headers) or self._scope_refusal(scope, route, darkens)
+        if refusal is None and darkens:  # which has no body, and waits for none
+            await self._app(scope, receive, send)
+        elif refusal is None:
             upload = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
             async with self._uploads if upload else nullcontext():
                 refusal = await self._with_body(scope, receive, send, upload)
         if refusal is None:
+            if found := state.get("refusal"):
+                self._record(scope, route, *found)
             return
         slug, detail, status = refusal
-        response = problem_response(scope["path"], slug, detail, status=status)
+        self._record(scope, route, slug, detail)
+        if darkens:
+            why = "Log in again" if slug == "unauthorized" else detail
+            detail = f"{why}. The stage was NOT darkened: press the wired emergency stop."
+        more = {"scope": route.scopes[0]} if slug == "forbidden" and route and route.scopes else {}
+        response = problem_response(scope["path"], slug, detail, status=status, **more)
         response.headers["connection"] = "close"
         if slug == "unauthorized":
             response.headers["www-authenticate"] = "Bearer"
         await response(scope, receive, _lingering(headers, receive, send))
+
+    def _scope_refusal(
+        self, scope: Scope, route: Route | None, darkens: bool
+    ) -> tuple[str, str, int | None] | None:
+        """Why whoever asks may not; who it is stands in the scope's state from here on."""
+        headers = Headers(scope=scope)
+        identify = partial(self._access.identity, secure=scope["scheme"] == "https")
+        identity = identify(headers)
+        if identity is None and darkens:
+            identity = self._access.darkens(headers)
+        scope["state"] |= {"identity": identity, "identify": identify}
+        if route is not None and route.open:
+            return None
+        if identity is None:
+            detail = (
+                "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown, or the "
+                "login is over"
+            )
+            return "unauthorized", detail, None
+        if route is not None and route.scopes and not route.allows(identity.scopes):
+            needed = " or ".join(map(repr, route.scopes))
+            return "forbidden", f"this needs a token with the scope {needed}", None
+        return None
+
+    def _record(self, scope: Scope, route: Route | None, slug: str, detail: str) -> None:
+        """Have the audit log name who was refused what, where it matters who tried."""
+        if self._refusals is None or route is None or not route.audited:
+            return
+        identity, client = scope["state"].get("identity"), scope.get("client")
+        self._refusals.note(
+            identity.name if identity is not None else "",
+            f"{client[0]}:{client[1]}" if client else "this machine",
+            NAMES.get(route.path, f"{route.method} {route.path}"),
+            scope["path"],
+            slug,
+            detail,
+        )
 
     async def _with_body(
         self, scope: Scope, receive: Receive, send: Send, upload: bool
@@ -212,13 +252,6 @@ def _again(message: Message, receive: Receive) -> Receive:
         return waiting.pop() if waiting else await receive()
 
     return next_message
-
-
-def _open(scope: Scope) -> bool:
-    """Whether it may be asked by somebody unknown."""
-    path = scope["path"]
-    public = path in OPEN or path.startswith((VIEW_PAGE, FOLDER))
-    return public or (scope["method"], path) == ("POST", LOGIN)
 
 
 def _name(host: str) -> str:

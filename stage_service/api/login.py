@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+from concurrent.futures import Future
+from contextlib import suppress
 from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 
 from stage_service.api.problems import problem_response
-from stage_service.api.steering import Anybody, OnService
+from stage_service.api.steering import RIGHT, Anybody, OnService, address_of
+from stage_service.captures import control
 from stage_service.captures.control import Caller
 from stage_service.records import logins
-from stage_service.records.tokens import Identity, Scope
+from stage_service.records.tokens import Identity, Scope, UnknownToken
 
 LOGIN = "/login"
 
@@ -39,15 +44,26 @@ router = APIRouter(tags=["login"])
 
 
 @open_to_all.post(LOGIN)
-def log_in(body: LoginRequest, request: Request, response: Response, service: OnService) -> Who:
+async def log_in(
+    body: LoginRequest, request: Request, response: Response, service: OnService
+) -> Who:
     """Log a browser in by a token, for 12 hours. The cookie stands for the token; it is sent to
-    this service alone, by its own pages alone, and no script reads it."""
+    this service alone, by its own pages alone, and no script reads it. After some wrong tokens the
+    next login from that address is refused for a while (429, `Retry-After`)."""
     access = request.app.state.access
-    identity: Identity = access.of_token(body.token)
-    if access.tokens is not None:
-        held = access.logins.begin(body.token, place(request.headers))
-        response.headers["Set-Cookie"] = _cookie(request, held, logins.LASTS_S)
-        service.record_login(identity.name, request.client)
+    if access.tokens is None:
+        return _who(request, access.of_token(body.token))
+    origin = _origin(request)
+    access.attempts.check(origin)
+    try:
+        identity: Identity = access.of_token(body.token)
+    except UnknownToken:
+        access.attempts.failed(origin)
+        raise
+    held = access.logins.begin(body.token, place(request.headers))
+    response.headers["Set-Cookie"] = _cookie(request, held, logins.LASTS_S)
+    by = Caller(address_of(request), name=identity.name, scopes=identity.scopes)
+    await _recorded(service.record_login(by, "login"))
     return _who(request, identity)
 
 
@@ -58,17 +74,34 @@ async def who(request: Request, by: Anybody) -> Who:
 
 
 @router.post("/logout", response_model=Who)
-def log_out(request: Request, response: Response, by: Anybody) -> Who | Response:
+async def log_out(
+    request: Request, response: Response, by: Anybody, service: OnService
+) -> Who | Response:
     """End the login: its cookie opens nothing any more, whoever kept it. The right to a blackout
     stays."""
     access, held = request.app.state.access, cookies(request.headers, _secure(request))
     answer: Who | Response = _who(request, by)
     try:
-        access.logins.end(held, place(request.headers))
+        await run_in_threadpool(access.logins.end, held, place(request.headers))
     except logins.NotStored as error:
         answer = response = problem_response(request.url.path, "not-stored", str(error))
+    await _recorded(service.record_login(by, "logout"))
     response.headers["Set-Cookie"] = _cookie(request, "", 0)
     return answer
+
+
+async def _recorded(line: Future[None]) -> None:
+    """Wait for the line, as everybody does, without a thread."""
+    with suppress(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(line)), control.RECORDED_S)
+
+
+def _origin(request: Request) -> str:
+    """What wrong logins are counted by: the page, where its right to a blackout shows that it has
+    once logged in, so that no other program at its address keeps it out; else the address."""
+    name = request.app.state.access.logins.blackout_by(request.headers.get(RIGHT, ""))
+    host = request.client.host if request.client else "this machine"
+    return host if name is None else f"a page of {name}"
 
 
 def place(headers: Headers) -> str:

@@ -36,6 +36,7 @@ from stage_service.inputs import BadInput
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
+from stage_service.records.attempts import TooManyLogins
 from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
 from stage_service.storage import BadUpload, InUse, NotThere
@@ -66,6 +67,9 @@ forbidden 403 This token does not allow that
     `scope` is what it lacks. Abort and blackout are open to every token.
 foreign-origin 403 A web page of another site asked
     A browser sent this for a page that is not this service's own.
+too-many-logins 429 Wait before you log in again
+    Too many wrong tokens came from this address. `Retry-After` has the seconds. No other address
+    waits for that, no token that is sent with each request, and no blackout.
 too-large 413 The request is too large
     `detail` says what is allowed.
 invalid-request 422 The request does not fit the schema
@@ -178,6 +182,7 @@ BY_ERROR: dict[type[Exception], str] = {
     NoLease: "no-lease",
     Forbidden: "forbidden",
     UnknownToken: "unauthorized",
+    TooManyLogins: "too-many-logins",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
     ModelInUse: "model-in-use",
@@ -192,6 +197,8 @@ BY_ERROR: dict[type[Exception], str] = {
 }
 """Which error class becomes which kind; a subclass stands before its base."""
 
+WHO_MAY = {"unauthorized", "forbidden", "too-many-logins"}
+"""Kinds that are about who asks: the gate has them audited."""
 EXTRA = ("problems", "running", "state", "holder", "expires", "scope")
 """Attributes of an error that its problem document repeats."""
 
@@ -291,7 +298,12 @@ def install_problems(app: FastAPI) -> None:
     async def known(request: Request, error: Exception) -> Response:
         slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))
         extra = {k: getattr(error, k) for k in EXTRA if hasattr(error, k)}
-        return problem_response(request.url.path, slug, str(error), **extra)
+        response = problem_response(request.url.path, slug, str(error), **extra)
+        if slug in WHO_MAY:
+            request.state.refusal = slug, str(error)
+        if isinstance(error, TooManyLogins):
+            response.headers["retry-after"] = str(error.retry_after)
+        return response
 
     async def invalid(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)

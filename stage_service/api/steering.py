@@ -36,9 +36,8 @@ async def caller(
     ] = None,
 ) -> Caller:
     """Who asks; raises `Forbidden` where their token lacks a scope that the route needs."""
-    peer, identity = request.client, request.state.identity
-    address = f"{peer.host}:{peer.port}" if peer else "this machine"
-    by = Caller(address, lease, identity.name, identity.scopes)
+    identity = request.state.identity
+    by = Caller(address_of(request), lease, identity.name, identity.scopes)
     for scope in SCOPES:
         if scope in needed.scopes:
             by.require(scope)
@@ -47,12 +46,21 @@ async def caller(
 
 RIGHT = "Hairstage-Blackout"
 """The header with a page's right to a blackout."""
+
+
+def address_of(request: Request) -> str:
+    """Host and port from which a request comes, as the audit log has it."""
+    peer = request.client
+    return f"{peer.host}:{peer.port}" if peer else "this machine"
+
+
 OnService = Annotated[Service, Depends(on_service)]
 Anybody = Annotated[Caller, Security(caller)]
 """Any token will do."""
 Steers = Annotated[Caller, Security(caller, scopes=["steer"])]
 Arms = Annotated[Caller, Security(caller, scopes=["arm"])]
 Processes = Annotated[Caller, Security(caller, scopes=["jobs"])]
+Administrates = Annotated[Caller, Security(caller, scopes=["admin"])]
 READS = [Security(caller, scopes=["read"])]
 
 router = APIRouter()

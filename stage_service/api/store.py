@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from reconstruction.containment import LONGEST_NAME
 from stage_service.api.downloads import RANGES, tar_response
 from stage_service.api.lanes import OnLanes
-from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
+from stage_service.api.steering import READS, Administrates, OnService, Processes, Steers
 from stage_service.service_models import FILE_NAME
 from stage_service.storage import KEPT_DAYS, Folder, Removed, files_of
 from stage_service.verification import Verification
@@ -62,7 +62,7 @@ def list_models(service: OnService) -> list[Folder]:
 
 @router.delete("/models/{model}")
 async def remove_model(
-    model: str, service: OnService, lanes: OnLanes, by: Anybody, dry_run: DryRun = False
+    model: str, service: OnService, lanes: OnLanes, by: Administrates, dry_run: DryRun = False
 ) -> Removed:
     """Put a model into the trash; needs the scope admin."""
     return await lanes.jobs(service.storage.remove_model, model, by, dry_run=dry_run)
@@ -81,7 +81,7 @@ def list_trash(service: OnService) -> list[Removed]:
 
 
 @router.post("/trash/{name}/restore")
-def restore(name: str, service: OnService, by: Anybody) -> Removed:
+def restore(name: str, service: OnService, by: Administrates) -> Removed:
     """Put it back where it was; needs the scope admin."""
     return service.storage.restore(name, by)
 
@@ -89,7 +89,7 @@ def restore(name: str, service: OnService, by: Anybody) -> Removed:
 @router.delete("/trash")
 def empty_trash(
     service: OnService,
-    by: Anybody,
+    by: Administrates,
     older_than_days: Annotated[float, Query(ge=0, le=10_000)] = KEPT_DAYS,
     dry_run: DryRun = False,
 ) -> list[Removed]:

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response, Security
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from reconstruction import Camera
 from stage_service.api.downloads import file_response
 from stage_service.api.gate import VIEW, VIEW_PAGE
-from stage_service.api.steering import READS
+from stage_service.api.steering import READS, caller
 from stage_service.viewer import BadLight, NothingToView, Viewed, Viewing
 from stage_service.viewer.viewed import MOST_PIXELS
 from stage_service.web.headers import PAGE
@@ -76,6 +76,7 @@ class LightInView(Light):
 
 page = APIRouter(include_in_schema=False)
 reading = APIRouter(prefix=f"{VIEW}/models", dependencies=READS, tags=["viewer"])
+router = APIRouter(prefix=f"{VIEW}/models", dependencies=[Security(caller)], tags=["viewer"])
 
 
 async def on_viewing(request: Request) -> Viewing:
@@ -214,7 +215,7 @@ def get_environment(
     return model.lighting.environment(which, "", rotation_deg)
 
 
-@reading.put("/{name}/environments/{file}", openapi_extra=MAP)
+@router.put("/{name}/environments/{file}", openapi_extra=MAP)
 async def put_environment(
     model: OnModel,
     file: str,

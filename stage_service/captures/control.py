@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
@@ -18,6 +19,9 @@ T = TypeVar("T")
 STAGE = "stage"
 ANSWER_S = 1.0
 """A blackout is answered within this time: as unknown where it is not over by then."""
+RECORDED_S = 0.3
+"""An answer waits for so long for the audit log's disk; the line follows once that answers. A flush
+takes some ms, on a disk that takes frames some tens."""
 MOST_BLACKOUTS = 16
 """That go on at once; whoever asks for one more gets what the last of them comes to."""
 LATE = Blackout(
@@ -60,7 +64,7 @@ class Control:
     def __init__(self, audit: AuditLog) -> None:
         self.leases = Leases()
         self.audit = audit
-        self._blackouts: list[Future[dict[str, Any]]] = []
+        self._blackouts: list[Future[tuple[dict[str, Any], Future[None]]]] = []
         self._lock = threading.Lock()
 
     def do(
@@ -84,35 +88,39 @@ class Control:
             result = work()
         except Exception as error:
             why = f"{type(error).__name__}: {error}"
-            self.audit.record(who, action, subject or STAGE, "refused", why)
+            self._record(who, action, subject or STAGE, "refused", why)
             raise
-        self.audit.record(who, action, subject or str(result), detail=detail)
+        self._record(who, action, subject or str(result), detail=detail)
         return result
 
     def blackout(self, by: Caller, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """`work()`, a blackout, recorded with the state that it came to; anybody may.
 
-        Answered within `ANSWER_S` seconds, if need be as `LATE`, while it goes on beside.
+        Answered within `ANSWER_S` seconds, if need be as `LATE`, while it goes on beside. A disk
+        that holds back the record holds back no answer.
         """
-        who = self._who(by)
+        who, until = self._who(by), time.monotonic() + ANSWER_S
 
-        def recorded() -> dict[str, Any]:
+        def recorded() -> tuple[dict[str, Any], Future[None]]:
             try:
                 answer = work()
             except Exception as error:
                 why = f"{type(error).__name__}: {error}"
-                self.audit.record(who, "blackout", STAGE, "failed", why)
+                self.audit.later(who, "blackout", STAGE, "failed", why)
                 raise
-            self.audit.record(who, "blackout", STAGE, answer["state"], answer["detail"])
-            return answer
+            line = self.audit.later(who, "blackout", STAGE, answer["state"], answer["detail"])
+            return answer, line
 
         with self._lock:
             self._blackouts = [b for b in self._blackouts if not b.done()]
             if len(self._blackouts) < MOST_BLACKOUTS:
                 self._blackouts.append(beside(recorded, "blackout"))
             under_way = self._blackouts[-1]
-        over = wait([under_way], ANSWER_S).done
-        return under_way.result() if over else LATE.to_dict()
+        if not wait([under_way], until - time.monotonic()).done:
+            return LATE.to_dict()
+        answer, line = under_way.result()
+        wait([line], max(0.0, min(RECORDED_S, until - time.monotonic())))
+        return answer
 
     def record_arming(
         self, by: Caller, capture: str, armed_by: str | None, consent: str | None = None
@@ -120,7 +128,14 @@ class Control:
         """Record who answers for flashes, where anybody does."""
         if armed_by is not None:
             detail = f"armed by {armed_by}; consent: {consent or 'as in the plan'}"
-            self.audit.record(self._who(by), "flash.armed", capture, detail=detail)
+            self._record(self._who(by), "flash.armed", capture, detail=detail)
+
+    def _record(
+        self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
+    ) -> None:
+        """The line is on the disk on return, or follows once the disk answers: an abort must not
+        wait for it, nor take the threads of a blackout."""
+        wait([self.audit.later(who, action, subject, result, detail)], RECORDED_S)
 
     def _who(self, caller: Caller) -> str:
         holder = self.leases.holder(caller.token)

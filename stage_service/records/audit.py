@@ -6,6 +6,7 @@ import logging
 import os
 import threading
 from collections import deque
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from reconstruction.reading import printable
 log = logging.getLogger("hairstage.audit")
 SERVICE = "service"
 """Who acts when nobody asked for it."""
+MOST_WAITING = 1000
+"""Lines that wait for a disk that does not answer, 0.5 MB; more go to the service's log alone."""
 
 
 class Action(BaseModel):
@@ -34,31 +37,87 @@ class Action(BaseModel):
 
 
 class AuditLog:
-    """`path`, append-only; each line is on the disk when `record` returns."""
+    """`path`, append-only; each line is on the disk when `record` returns. Lines are written in the
+    order in which they were recorded."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.Lock()
+        self._queue = threading.Lock()
+        self._waiting: deque[tuple[str, Future[None]]] = deque()
+        self._writing = False
+        self._last: Future[None] | None = None
 
     def record(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
     ) -> None:
         """Append an action. A disk that is full is logged: it must not keep a lamp lit."""
+        done, mine = self._enter(who, action, subject, result, detail)
+        if mine:
+            self._write()
+        done.result()
+
+    def later(
+        self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
+    ) -> Future[None]:
+        """As `record`, for callers that must not wait for a disk; done once the line is written."""
+        done, mine = self._enter(who, action, subject, result, detail)
+        if mine:
+            try:
+                threading.Thread(target=self._write, name="audit", daemon=True).start()
+            except RuntimeError:  # no thread is to be had: the next one writes it, too
+                self._writing = False
+        return done
+
+    def flush(self, within_s: float) -> None:
+        """Wait, no longer than this, until what was recorded is on the disk."""
+        if self._last is not None:
+            wait([self._last], within_s)
+
+    def _enter(
+        self, who: str, action: str, subject: str, result: str, detail: str
+    ) -> tuple[Future[None], bool]:
+        """When the line is written; whether the caller is the one to write what waits."""
         who, subject, detail = (printable(text) for text in (who, subject, detail))
         line = Action(
             time=utc_now(), who=who, action=action, subject=subject, result=result, detail=detail
         ).model_dump_json()
-        try:
-            with self._lock, self._path.open("ab+") as file:
-                # What a crash left of a line must not swallow this one.
-                if file.tell():
-                    file.seek(-1, os.SEEK_END)
-                    line = line if file.read(1) == b"\n" else f"\n{line}"
-                file.write(f"{line}\n".encode())
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError:
-            log.exception("%s: not recorded: %s", self._path, line)
+        done: Future[None] = Future()
+        with self._queue:
+            if len(self._waiting) >= MOST_WAITING:
+                log.error(
+                    "%s: %d lines wait for the disk; lost: %s", self._path, MOST_WAITING, line
+                )
+                done.set_result(None)
+                return done, False
+            self._waiting.append((line, done))
+            self._last = done
+            mine, self._writing = not self._writing, True
+        return done, mine
+
+    def _write(self) -> None:
+        while True:
+            with self._queue:
+                if not self._waiting:
+                    self._writing = False
+                    return
+                line, done = self._waiting.popleft()
+            try:
+                self._append(line)
+            except OSError:
+                log.exception("%s: not recorded: %s", self._path, line)
+            finally:
+                done.set_result(None)
+
+    def _append(self, line: str) -> None:
+        with self._lock, self._path.open("ab+") as file:
+            # What a crash left of a line must not swallow this one.
+            if file.tell():
+                file.seek(-1, os.SEEK_END)
+                line = line if file.read(1) == b"\n" else f"\n{line}"
+            file.write(f"{line}\n".encode())
+            file.flush()
+            os.fsync(file.fileno())
 
     def latest(self, limit: int) -> list[Action]:
         """The newest actions, oldest of them first; a torn line is left out."""

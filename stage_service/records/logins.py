@@ -60,10 +60,10 @@ class Ended(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    epoch: str = Field(default_factory=lambda: secrets.token_urlsafe(9))
-    turn: int = 0
-    logins: dict[str, dict[str, int]] = {}
-    turns: dict[str, int] = {}
+    epoch: str
+    turn: int
+    logins: dict[str, dict[str, int]]
+    turns: dict[str, int]
 
     def has(self, login: Login) -> bool:
         """Whether that login is over."""
@@ -96,7 +96,8 @@ class Logins:
         self._key = SigningKey(None if root is None else root / KEY_FILE)
         self._file = None if root is None else root / LOGOUTS_FILE
         self._lock = threading.Lock()
-        self._ended, self._stored = Ended(), False
+        epoch = secrets.token_urlsafe(9)
+        self._ended, self._stored = Ended(epoch=epoch, turn=0, logins={}, turns={}), False
         self._read()
 
     def begin(self, token: str, place: str) -> str:

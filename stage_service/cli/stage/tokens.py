@@ -31,7 +31,8 @@ def add(commands: Commands) -> None:
     listed = add_command(token, "list", run_list)
     revoke = add_command(token, "revoke", run_revoke)
     revoke.add_argument("name")
-    for parser in (make, listed, revoke):
+    pages = add_command(token, "revoke-blackouts", run_revoke_blackouts)
+    for parser in (make, listed, revoke, pages):
         parser.add_argument("--root", type=Path, default=Path("runs/stage"), help="the service's")
     add_command(token, "show", run_show)
 
@@ -51,7 +52,7 @@ def run_make(args: argparse.Namespace, output: Output) -> None:
         raise BadArgument(f"--scopes: there is no {sorted(unknown)}; there are {', '.join(SCOPES)}")
     args.root.mkdir(mode=0o750, parents=True, exist_ok=True)
     token = _tokens(args).make(args.name, scopes)
-    _record(args, "token.make", ", ".join(scopes))
+    _record(args, "token.make", args.name, ", ".join(scopes))
     output.result({"name": args.name, "scopes": scopes, "token": token}, token)
 
 
@@ -63,10 +64,31 @@ def run_list(args: argparse.Namespace, output: Output) -> None:
 
 
 def run_revoke(args: argparse.Namespace, output: Output) -> None:
-    """End a token; a running service knows at once."""
+    """End a token and its logins; counts at once in a running service.
+
+    A page that has logged in by it can still black out, and do nothing else: darkness harms nobody.
+    'hairstage token revoke-blackouts' ends that, for all pages.
+    """
     _tokens(args).revoke(args.name)
-    _record(args, "token.revoke", "")
+    _record(args, "token.revoke", args.name)
     output.result({"revoked": args.name}, f"{args.name} has no token any more")
+
+
+def run_revoke_blackouts(args: argparse.Namespace, output: Output) -> None:
+    """End all blackout rights of pages, and all logins; people log in again.
+
+    A page that has once logged in keeps the right to black out, and to nothing else, beyond its
+    login's end and its token's. Replaces the key in ROOT/login.key; counts at once in a running
+    service. Tokens stay.
+    """
+    from stage_service.records.signing import KEY_FILE, write_key
+
+    file = args.root / KEY_FILE
+    if not args.root.is_dir():
+        raise BadArgument(f"--root {args.root}: there is no such folder")
+    write_key(file)
+    _record(args, "blackout.revoke", "service")
+    output.result({"key": str(file)}, "all blackout rights and all logins have ended")
 
 
 def run_show(_args: argparse.Namespace, output: Output) -> None:
@@ -88,8 +110,8 @@ def _tokens(args: argparse.Namespace) -> Tokens:
     return Tokens(args.root / TOKENS)
 
 
-def _record(args: argparse.Namespace, action: str, detail: str) -> None:
+def _record(args: argparse.Namespace, action: str, subject: str, detail: str = "") -> None:
     from stage_service.cli.support.client import me
     from stage_service.records.audit import AuditLog
 
-    AuditLog(args.root / "audit.jsonl").record(me(), action, args.name, detail=detail)
+    AuditLog(args.root / "audit.jsonl").record(me(), action, subject, detail=detail)

@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
+from disks import on_small_disk, require_small_disk
 
 SCRIPT = Path(__file__).with_name("full_disk.py")
-MOUNT = 'mount -t tmpfs -o size=40m tmpfs "$0" && exec "$@"'
-
-
-def on_small_disk(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["unshare", "--map-root-user", "--mount", "sh", "-c", MOUNT, str(folder), *command],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
 
 LOCKED = """
 import sys
@@ -43,15 +31,6 @@ except RootInUse:
 lock.release()
 RootLock(folder).release()
 """
-
-
-def require_small_disk(folder: Path) -> None:
-    try:
-        possible = on_small_disk(folder, "true")
-    except FileNotFoundError as error:
-        pytest.skip(f"no file system of our own: {error}")
-    if possible.returncode:
-        pytest.skip(f"no file system of our own: {possible.stderr.strip()}")
 
 
 def shoot(folder: Path, reserve: int) -> dict[str, Any]:
