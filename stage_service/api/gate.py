@@ -144,8 +144,8 @@ class Gate:
             return None
         if identity is None:
             detail = (
-                "the header 'Authorization: Bearer TOKEN' is missing, or its token unknown, or the "
-                "login is over"
+                "log in again: the request has neither the header 'Authorization: Bearer TOKEN' "
+                "with a token that is known here, nor the cookie of a login that is not over"
             )
             return "unauthorized", detail, None
         if route is not None and route.scopes and not route.allows(identity.scopes):

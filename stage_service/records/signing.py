@@ -22,6 +22,8 @@ log = logging.getLogger("hairstage.logins")
 KEY_FILE = "login.key"
 KEY_BYTES = 32
 """As long as the hash (SHA-256): a longer key adds nothing."""
+LOOK_S = 1.0
+"""How often the file is looked at: a thread for each request would cost more than the check."""
 LONGEST_TEXT = 4096
 """Characters of a signed text; a longer one is none of ours."""
 
@@ -31,7 +33,8 @@ class SigningKey:
 
     A key that is missing, damaged, or was readable by other users is replaced at the start: what
     was signed before is void, and nothing opens by it. A key that another process replaces counts
-    from the next look on; one that disappears, or that a hanging disk holds back, stays as it was.
+    from the next look on (`LOOK_S`); one that disappears, or that a hanging disk holds back, stays
+    as it was.
     A disk that takes no key leaves one that lasts as long as the process; it is stored as soon as
     the disk takes it. So it is without `path`.
     """
@@ -52,7 +55,7 @@ class SigningKey:
         except (OSError, ValueError) as error:
             log.warning("%s: logins and blackout rights begin anew: %s", path, error)
             self._store()
-        self._file = WatchedFile(path, self._newest, self._key, 0.0)
+        self._file = WatchedFile(path, self._newest, self._key, wait_s=0.0, every_s=LOOK_S)
 
     def sign(self, purpose: str, data: dict[str, Any]) -> str:
         """`data` as a text of URL-safe characters, which `verify` takes for this purpose alone."""

@@ -68,7 +68,7 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, WAIT_S)
+        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""

@@ -19,24 +19,30 @@ Version = tuple[int, int, int] | None
 class WatchedFile(Generic[T]):
     """What `read()` returns, called again on a thread of its own once `path` has changed.
 
-    `value` waits at most `wait_s` seconds for the disk, and returns the last value meanwhile.
+    `value` waits at most `wait_s` seconds for the disk, and returns the last value meanwhile. It
+    looks at the disk once in `every_s` seconds.
     """
 
-    def __init__(self, path: Path, read: Callable[[], T], first: T, wait_s: float) -> None:
-        self._path, self._read, self._wait_s = path, read, wait_s
+    def __init__(
+        self, path: Path, read: Callable[[], T], first: T, *, wait_s: float, every_s: float = 0.0
+    ) -> None:
+        self._path, self._read, self._wait_s, self._every_s = path, read, wait_s, every_s
         self._last: tuple[Version, T] = (None, first)
         self._looking = threading.Lock()
         self._look: Future[T] | None = None
-        self._until = 0.0
+        self._until = self._due = 0.0
 
     @property
     def value(self) -> T:
         """The newest value; raises nothing that has to do with the disk."""
         with self._looking:
-            if self._look is None or self._look.done():
+            now = time.monotonic()
+            if (self._look is None or self._look.done()) and now >= self._due:
                 self._look = beside(self._looked, self._path.name)
-                self._until = time.monotonic() + self._wait_s
-            look, left = self._look, max(0.0, self._until - time.monotonic())
+                self._until, self._due = now + self._wait_s, now + self._every_s
+            look, left = self._look, max(0.0, self._until - now)
+        if look is None:
+            return self._last[1]
         return look.result() if wait([look], left).done else self._last[1]
 
     def _looked(self) -> T:
