@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # or each of the many processes that tests start compiles the product anew
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-all run-tests test-peers bench lint clean
+.PHONY: help setup demo test test-all run-tests test-peers bench lint docs linkcheck dist ledger clean
 
 help:  ## Say what the targets do
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -48,5 +48,18 @@ lint: setup  ## Style, types, floors
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: setup  ## Build the documentation into docs/_build; warnings are errors
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
+
+linkcheck: setup  ## Check the links of the documentation, other hosts' too
+	$(BIN)/sphinx-build -q -b linkcheck docs docs/_build/linkcheck
+
+dist: setup  ## Build sdist and wheel into dist/
+	rm -rf dist
+	$(BIN)/python -m build -q
+
+ledger: setup  ## Print lines, words, circles of imports, old vocabulary; OPTIONS='--parts --words'
+	$(BIN)/python tests/tools/ledger.py $(OPTIONS)
+
 clean:  ## Remove what the targets made
-	rm -rf $(VENV) runs build *.egg-info
+	rm -rf $(VENV) runs build dist docs/_build docs/reference/generated *.egg-info

@@ -248,13 +248,12 @@ def problem_response(
 
 
 def errors_page() -> str:
-    """The text of docs/reference/errors.md."""
+    """The page of all kinds, at `PAGE` and in the documentation."""
     parts = ["# Errors of the HTTP API", ""]
     parts += [
         "Every error is a problem document (RFC 9457, `application/problem+json`) with `type`,",
         "`title`, `status`, `detail` and `instance`; `type` is the path of this page with one of",
-        "the anchors below. The page is written from the table in",
-        "`stage_service/api/problems.py`.",
+        "the anchors below.",
     ]
     for kind in KINDS.values():
         status = f"{kind.status} {HTTPStatus(kind.status).phrase}"

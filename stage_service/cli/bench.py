@@ -19,6 +19,7 @@ BENCHMARKS = {
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
     "captures": "10,000 captures in a root: the service's start, and a page of them",
     "console": "a capture and an idle service, beside three open pages, streams of events, nobody",
+    "demo": "the demo over subjects and seeds beside its baselines, from runs that were made",
     "exports": "a model opened, rendered and written by Blender, beside ours",
     "fields": "fields of reflectance beside baselines on new lights and views; their solver",
     "frames": "the simulators' frames beside many paths: error against run time",

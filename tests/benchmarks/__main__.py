@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from importlib import import_module
 
 from benchmarks.command import Benchmark, LeftOut
+from benchmarks.publish import check_tree, publish
 from stage_service.cli.bench import BENCHMARKS
 from stage_service.cli.stage.processes import exit_on_sigterm
 from stage_service.cli.support.commands import (
@@ -26,6 +28,7 @@ MODULES = {
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "captures": "benchmarks.acquisition.listing",
     "console": "benchmarks.service.watched",
+    "demo": "benchmarks.demo",
     "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
@@ -51,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     commands = parser.add_subparsers(metavar="NAME", required=True)
     for name, text in BENCHMARKS.items():
         command = add_command(commands, name, run_bench, text)
-        command.set_defaults(name=name)
+        command.set_defaults(name=name, arguments=argv[1:])
         chosen = argv[:1] == [name]  # the others' modules need not be loaded
         for benchmark in _benchmarks(name).values() if chosen else ():
             benchmark.add_options(command)
@@ -68,10 +71,17 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
     """Run one benchmark, or all; of all, those go without that lack their data."""
     args.out.mkdir(parents=True, exist_ok=True)
     results = {}
+    if args.publish:
+        check_tree(args.quick)
     for name, benchmark in _benchmarks(args.name).items():
         try:
+            begun = time.monotonic()
             with progress_bar(f"bench {name}") as progress:
                 results[name] = benchmark.run(args, progress)
+            if args.publish:
+                took = time.monotonic() - begun
+                page = publish(name, results[name], args.arguments, args.out, took)
+                output.note(f"published {page}")
         except LeftOut as error:
             if args.name != "all":
                 raise CommandError(f"bench {name}: {error}", FAILED) from error

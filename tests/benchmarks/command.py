@@ -39,6 +39,7 @@ def option(flag: str, help: str, **settings: Any) -> Option:
 OUT = option("--out", "folder of the results", type=Path, default=Path("runs/bench"))
 SEED = option("--seed", "of all random numbers", type=int, default=0)
 QUICK = option("--quick", "as little as shows that it runs; no figures", action="store_true")
+PUBLISH = option("--publish", "write docs/benchmarks/NAME.md and .json too", action="store_true")
 CACHE = option("--cache", "where captures are kept", type=Path, default=Path("runs/cache"))
 CAPTURE = option("--capture", f"that Cycles rendered; default: ${DATA}/{CYCLES}", type=Path)
 ONLY = option("--only", "one subject")
@@ -60,8 +61,8 @@ class Benchmark:
     options: tuple[Option, ...] = ()
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Add `--out`, `--seed`, `--quick` and its own, where another one has not already."""
-        for option in (OUT, SEED, QUICK, *self.options):
+        """Add `--out`, `--seed`, `--quick`, `--publish` and its own, unless another one has."""
+        for option in (OUT, SEED, QUICK, PUBLISH, *self.options):
             if option.flag not in parser._option_string_actions:
                 parser.add_argument(option.flag, **option.settings)
 

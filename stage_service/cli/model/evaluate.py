@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +132,23 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
     """
     from stage_service.cli.support.tables import figures_of, markdown_table
 
+    columns = demo_columns(args.results)
+    output.result(
+        {
+            "results": columns,
+            "figures": {name: figures_of(results) for name, results in columns.items()},
+        },
+        markdown_table(columns, short=args.short),
+    )
+
+
+def demo_columns(paths: Sequence[Path]) -> dict[str, list[dict[str, Any]]]:
+    """Results of demos by the name of their column: one for each subject, its seeds together.
+
+    Raises `CommandError` for a file that is no demo's.
+    """
     by_subject: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
-    for path in args.results:
+    for path in paths:
         results = _demo_results(path)
         by_subject.setdefault(results["subject"], []).append((path, results))
     columns: dict[str, list[dict[str, Any]]] = {}
@@ -148,13 +164,7 @@ def run_table(args: argparse.Namespace, output: Output) -> None:
         else:  # versions of one demo, not samples
             for path, results in found:
                 columns[f"{subject}, seed {results['seed']} ({path})"] = [results]
-    output.result(
-        {
-            "results": columns,
-            "figures": {name: figures_of(results) for name, results in columns.items()},
-        },
-        markdown_table(columns, short=args.short),
-    )
+    return columns
 
 
 def _demo_results(path: Path) -> dict[str, Any]:
