@@ -25,7 +25,7 @@ from stage_service.cli import build_parser
 ROOT = Path(__file__).resolve().parents[1]
 MADE_BY_DOCS = {"generated", "_build"}
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "THIRD_PARTY.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "THIRD_PARTY.md")),
     *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.parent.name not in MADE_BY_DOCS),
 ]
 FLOORS = ("reconstruction", "appearance", "stage_service", "simulators")
