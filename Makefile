@@ -25,8 +25,8 @@ setup: $(BIN)/.installed  ## Make .venv, install everything, find or install lib
 demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
 	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))
 
-test: setup test-peers  ## Run the tests, and beside them lint (under 12 minutes on 2 cores)
-	@$(MAKE) --no-print-directory -k -j 2 lint run-tests
+test: setup test-peers  ## Run the tests, and beside them lint and docs (under 12 minutes on 2 cores)
+	@$(MAKE) --no-print-directory -k -j 2 lint docs run-tests
 
 test-all: setup test-peers  ## Run the slow tests too (under 60 minutes)
 	@$(MAKE) --no-print-directory -k -j 2 lint run-tests WHICH='slow or not slow'
