@@ -26,6 +26,7 @@ from pydantic import (
 from reconstruction import Rig
 from reconstruction.containment import LONGEST_NAME
 from reconstruction.geometry.rig import RigError
+from stage_service.wire_names import unfit_projectors, unfit_serials
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0
 """Exposures that the trigger box makes."""
@@ -360,7 +361,19 @@ def load_rig_file(path: str | Path, devices: str | Path | None = None) -> RigFil
         _validate(path, {k: v for k, v in tables.items() if k != "devices"})
         merged = _merge(tables.get("devices", {}), override["devices"])
         read = _validate(devices, {**tables, "devices": merged})
+    _check_names(path, rig, read.devices)
     return RigFile(path, rig, read.devices, read.capture, read.safety)
+
+
+def _check_names(path: Path, rig: Rig, devices: DevicesConfig | None) -> None:
+    """Raise `RigError` for names of the rig that its devices' wires cannot carry."""
+    unfit: list[str] = []
+    if devices is not None and devices.projectors is not None:
+        unfit += unfit_projectors([p.name for p in rig.projectors])
+    if devices is not None and isinstance(devices.cameras, BaslerConfig):
+        unfit += unfit_serials(devices.cameras.serials, [c.name for c in rig.cameras])
+    if unfit:
+        raise RigError(f"{path}: " + "; ".join(unfit))
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -7,17 +7,30 @@ import select
 import threading
 import tty
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """What an RS-485 adapter does to a line: `echo` sends back whatever the client sends; `before`
+    and `after` are bytes that it puts around each answer."""
+
+    echo: bool = False
+    before: bytes = b""
+    after: bytes = b""
 
 
 class Terminal:
     """The near end of a pseudo-terminal; `link` points to the far one, the client's.
 
     One thread receives and sends; `wake` may be called from any. Made plugged in, without a link.
+    `adapter` is what stands between the two ends.
     """
 
     def __init__(self, link: Path) -> None:
         self.link = link
+        self.adapter = Adapter()
         self._wake_read, self._wake_write = os.pipe()
         self._make()
 
@@ -38,11 +51,14 @@ class Terminal:
         ready, _, _ = select.select([self._near, self._wake_read], [], [], within_s)
         if self._wake_read in ready:
             return None
-        return os.read(self._near, 4096) if ready else b""
+        data = os.read(self._near, 4096) if ready else b""
+        if self.adapter.echo and data:
+            os.write(self._near, data)
+        return data
 
     def send(self, data: bytes) -> None:
         """Send to the far end."""
-        os.write(self._near, data)
+        os.write(self._near, self.adapter.before + data + self.adapter.after)
 
     def stops_within(self, seconds: float) -> bool:
         """Wait so long; at once True when the peer is to stop."""
@@ -96,6 +112,10 @@ class TerminalPeer(ABC):
         self._terminal.make_link()
         self._thread.start()
         return str(self.link)
+
+    def stand_behind(self, adapter: Adapter) -> None:
+        """Have this adapter between the client and the device from now on."""
+        self._terminal.adapter = adapter
 
     def stop(self) -> None:
         """Remove the link and close the terminal."""

@@ -7,6 +7,7 @@ import threading
 import time
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import serial
 
@@ -24,6 +25,18 @@ MOST_LINES = 1000
 """A device that has sent so many without its identity is another, however fast it goes on."""
 REFUSED_BY_SAFETY = 3
 WATCHDOG_S = (0.1, 60.0)
+_PLACES = {"n": r"(\d+)", "word": "([a-z-]+)", "text": "(.+)"}
+_ECHOES = "The line sends back what it gets: switch the adapter's local echo off."
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a kind of device answers to `ID?`: its first word, the whole as a pattern, and how an
+    error describes it."""
+
+    word: str
+    pattern: re.Pattern[str]
+    shown: str
 
 
 class SerialLines:
@@ -31,10 +44,10 @@ class SerialLines:
 
     After a missed deadline or a broken reply the port is closed; the next request opens it, drains
     what came late and reads on until the device has identified itself, so no late reply answers a
-    later request.
+    later request. A request that comes back, and an empty line, are dropped: neither is a reply.
     """
 
-    def __init__(self, name: str, config: SerialConfig, identity: re.Pattern[str]) -> None:
+    def __init__(self, name: str, config: SerialConfig, identity: Identity) -> None:
         self.name = f"{name} ({config.port})"
         self.config = config
         self._identity = identity
@@ -64,19 +77,22 @@ class SerialLines:
             self._port = None
 
     def ask(self, request: str, reply: str, doing: str) -> re.Match[str]:
-        """Send `request` and return the match of the reply with the pattern `reply`.
+        """Send `request` and return the match of the reply, whose groups are its places.
 
-        Raises `DeviceError`: `SafetyRefusal` for the device's error 3.
+        `reply` is a text with places in it: `<n>` a number, `<word>` small letters and hyphens,
+        `<text>` anything, `<a|b>` one of these. Raises `DeviceError`: `SafetyRefusal` for the
+        device's error 3.
         """
+        return self._ask(request, _pattern(reply), reply, doing)
+
+    def _ask(self, request: str, pattern: str, reply: str, doing: str) -> re.Match[str]:
         with self._lock:
             if self._port is None:
                 self.connect()
             self._send(request, doing)
             deadline = time.monotonic() + self.config.timeout_s
-            line = self._line(deadline, doing)
-            while self._identity.fullmatch(line):  # came late, after its deadline
-                line = self._line(deadline, doing)
-            if match := re.fullmatch(reply, line):
+            line = self._reply(request, deadline, doing)
+            if match := re.fullmatch(pattern, line):
                 return match
             error = re.fullmatch(r"ERR (\d+) ?(.*)", line)
             if error is None:
@@ -92,7 +108,7 @@ class SerialLines:
 
     def echo(self, request: str, doing: str) -> None:
         """`ask` for what the device does and repeats."""
-        self.ask(request, re.escape(f"OK {request}"), doing)
+        self._ask(request, re.escape(f"OK {request}"), f"OK {request}", doing)
 
     def set_watchdog(self, seconds: float) -> None:
         """Set the device's watchdog; raises `ValueError` beyond what devices take."""
@@ -122,25 +138,49 @@ class SerialLines:
         self.ask("ARM", f"OK ARM {steps} {crc:08x}", f"arming the {whole}")
 
     def _identify(self) -> re.Match[str]:
-        doing = "identifying"
+        doing, seen = "identifying", ""
         # "?" ends what a device may hold of a request that was cut off; the two make no request.
-        self._send("?\nID?", doing)
+        own = ("?", "ID?")
+        self._send("\n".join(own), doing)
         deadline = time.monotonic() + self.config.timeout_s
-        seen: str | None = None
         for _ in range(MOST_LINES):
             try:
                 line = self._line(deadline, doing)
             except DeviceTimeout:
-                if seen is None:
+                if not seen:
                     raise
                 break
-            if match := self._identity.fullmatch(line):
+            if match := self._identity.pattern.fullmatch(line):
                 return match
-            seen = line
+            if line and (line not in own or seen in ("", *own)):
+                seen = line
         self.close()
-        expected = f"an identity like {self._identity.pattern!r}"
-        todo = "This is another device: check the ports in the rig file."
+        expected, todo = self._identity.shown, self._advice(seen, own)
         raise self._error(DeviceError, doing, expected, repr(seen), todo)
+
+    def _advice(self, seen: str, own: Sequence[str]) -> str:
+        """What to do about a device that has said this of itself."""
+        if seen in own:
+            return f"{_ECHOES} No device answers behind it: check its power and cable."
+        if seen.startswith(self._identity.word):
+            return "It is the right kind of device, with an identity that docs/wire.md excludes."
+        return "This is another device: check the ports in the rig file."
+
+    def _reply(self, request: str, deadline: float, doing: str) -> str:
+        """The first line that is neither empty, nor the request, nor an identity that came late."""
+        echoed = False
+        while True:
+            try:
+                line = self._line(deadline, doing)
+            except DeviceTimeout as error:
+                if not echoed:
+                    raise
+                received = "the request alone, which comes back"
+                kind, todo = DeviceTimeout, f"{_ECHOES} Check the device's power and cable."
+                raise self._error(kind, doing, "a reply", received, todo) from error
+            echo, echoed = line == request, echoed or line == request
+            if line and not echo and not self._identity.pattern.fullmatch(line):
+                return line
 
     def _send(self, request: str, doing: str) -> None:
         assert self._port is not None
@@ -178,3 +218,12 @@ class SerialLines:
         self, kind: type[DeviceError], doing: str, expected: str, received: str, todo: str
     ) -> DeviceError:
         return kind(self.name, doing, expected, received, todo, self.config.timeout_s)
+
+
+def _pattern(reply: str) -> str:
+    """A reply with places, as `SerialLines.ask` has it, as a pattern."""
+    parts = re.split("<([^>]*)>", reply)
+    return "".join(
+        _PLACES.get(part, f"({part})") if number % 2 else re.escape(part)
+        for number, part in enumerate(parts)
+    )

@@ -86,8 +86,10 @@ class SerialStage:
         self.box = SimulatedTriggerBox(self.wires, faults)
         stack.callback(self.box.stop)
         replies = {"trigger": self.box.reply, "projectors": self.controller.reply}
+        self.peers: dict[str, SerialPeer] = {}
         for name, reply in replies.items():
             peer = SerialPeer(folder / name, self.heard(name, reply), self.strikes(name))
+            self.peers[name] = peer
             peer.start()
             stack.callback(peer.stop)
         self.requests: list[str] = []

@@ -128,3 +128,71 @@ def test_a_devices_file_holds_devices_alone(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(RigError, match="no such rig file"):
         load_rig_file(tmp_path / "none.toml")
+
+
+BEAM = """
+[[projectors]]
+name = "beam"
+position = [0.1, -0.9, 0.5]
+target = [0.0, 0.0, 0.0]
+fov_deg = 20.0
+width = 16
+height = 16
+intensity = [20.0, 20.0, 20.0]
+[[projectors]]
+name = {name}
+position = [-0.1, -0.9, 0.5]
+target = [0.0, 0.0, 0.0]
+fov_deg = 20.0
+width = 16
+height = 16
+intensity = [20.0, 20.0, 20.0]
+[devices.projectors]
+port = "projectors"
+"""
+
+
+def with_projector(name: str) -> str:
+    beams, wire = BEAM.replace("{name}", name).split("[devices.projectors]")
+    geometry, devices = SMALL.split("[devices]")
+    return f"{geometry}{beams}[devices]{devices}[devices.projectors]{wire}"
+
+
+@pytest.mark.parametrize(
+    "name", ["left eye", "links_ö", 'a"b', "a,b", "a'b", "x" * 33, "<svg onload=x>"]
+)
+def test_projector_names_that_the_wire_cannot_carry_are_refused_as_they_are_read(tmp_path, name):
+    """F19: on the controller's lines blanks part words and commas names."""
+    (path := tmp_path / "rig.toml").write_text(with_projector(f"{name!r}"))
+    place = r"rig.toml: \[\[projectors\]\] number 2: name: the projector controller takes 1 to 32 "
+    with pytest.raises(RigError, match=place + "characters of the letters A to Z and a to z, digi"):
+        load_rig_file(path)
+
+
+def test_projector_names_that_the_wire_carries_are_taken(tmp_path):
+    (path := tmp_path / "rig.toml").write_text(with_projector(f"'{'Left.eye-2_' * 3}'"[:33] + "'"))
+    assert len(load_rig_file(path).rig.projectors[1].name) == 32
+
+
+def test_a_rig_without_a_projector_controller_may_call_its_projectors_as_it_likes(tmp_path):
+    text = with_projector("'left eye'").replace('[devices.projectors]\nport = "projectors"\n', "")
+    (path := tmp_path / "rig.toml").write_text(text)
+    assert load_rig_file(path).rig.projectors[1].name == "left eye"
+
+
+@pytest.mark.parametrize(
+    ("serials", "told"),
+    [
+        ('other = "1"', "serials: the serial number of the camera 'cam_00' is missing"),
+        ('cam_00 = "1"\nother = "2"', "serials.other: the rig has no camera 'other'"),
+        ('cam_00 = "0815 0000"', r"serials.cam_00: expected the letters.* got '0815 0000'"),
+    ],
+)
+def test_serial_numbers_are_those_of_the_rig_s_cameras(tmp_path, serials, told):
+    cameras = '[devices.cameras]\nkind = "basler"\ngain = 1.0\n[devices.cameras.serials]\n'
+    text = SMALL.replace(
+        "[devices.cameras]\nport = 15021\nbusy_s = 900.0\n", cameras + serials + "\n"
+    )
+    (path := tmp_path / "rig.toml").write_text(text)
+    with pytest.raises(RigError, match=told):
+        load_rig_file(path)

@@ -167,6 +167,8 @@ class LinkCamera:
                 todo = "Check the port in [devices.cameras]: this is another device."
                 raise self._error(doing, "length-prefixed JSON", str(error), todo) from error
         if answer.get("ok") is not True:
+            if answer.get("ok") is not False:  # no answer at all: the true one may still come
+                self.close()
             todo = "Check that the rig file is this stage's."
             raise self._error(doing, "ok", f"{answer.get('error', answer)}", todo)
         return answer, payload

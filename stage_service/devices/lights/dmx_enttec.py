@@ -60,6 +60,7 @@ class DmxLightBank:
         self._asked = 0  # bytes of user configuration, by the newest request
         self._bare = False  # whether the widget answers without any
         self._late = False  # whether an answer is missing
+        self._sent = b""  # since the port was last read empty
         self._port: ExclusivePort | None = None
         self._lock = threading.RLock()
 
@@ -138,12 +139,14 @@ class DmxLightBank:
                 # The widget's USB driver ignores the baud rate.
                 self._port = ExclusivePort(self.config.port, timeout_s=self.config.timeout_s)
             self._port.reset_input_buffer()
+            self._sent = b""
         except (OSError, termios.error) as error:
             raise self._lost("opening the port", error) from error
 
     def _send(self, label: int, data: bytes, doing: str) -> None:
         assert self._port is not None
         message = struct.pack("<BBH", _START, label, len(data)) + data + bytes([_END])
+        self._sent += message
         try:
             self._port.write(message)
         except OSError as error:
@@ -168,6 +171,9 @@ class DmxLightBank:
                     self.close()
                     got = came[:32].hex(" ") or "nothing"
                     todo = f"{_STILL_LIT} Check its USB cable, and that it is an Enttec USB Pro."
+                    if came and self._sent.endswith(came):
+                        got = "what was sent, which comes back"
+                        todo = f"{_STILL_LIT} What is at this port only echoes: check the port."
                     raise DeviceTimeout(self.name, doing, "its parameters", got, todo, timeout_s)
                 came += self._port.read(max(1, self._port.in_waiting))
         except OSError as error:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Sequence
-from typing import Any
 
-from pymodbus import ModbusException
-
-from reconstruction.geometry.rig import RigError
-from stage_service.config import OWNER_WORDS, LightRegisters, ModbusRtuConfig, ModbusTcpConfig
+from stage_service.config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
-from stage_service.devices.lights import limits, modbus_answers
+from stage_service.devices.lights import limits
+from stage_service.devices.lights import modbus_frames as frames
 from stage_service.devices.lights.interface import (
     LightCapabilities,
     LightStatus,
@@ -19,12 +17,23 @@ from stage_service.devices.lights.interface import (
     lamps_lit,
     mismatch_todo,
 )
-from stage_service.devices.lights.modbus_links import ModbusLink, open_link
+from stage_service.devices.lights.modbus_links import (
+    ModbusLink,
+    NotTheAnswer,
+    Unanswered,
+    open_link,
+)
+from stage_service.devices.lights.modbus_registers import (
+    TABLE_ENTRIES,
+    check_apart,
+    text_of,
+    words_of,
+)
 
+log = logging.getLogger("hairstage.lights")
 ALL_ON, ALL_OFF = 65535, 0
 MOST_WRITTEN, MOST_READ = 122, 124  # even, so that a table's entries stay whole; of 123 and 125
 MOST_COILS = 1968
-TABLE_ENTRIES = 4096
 _ATTEMPTS_TO_FALL_INTO_STEP = 3
 _EXCEPTIONS = {1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "refused now"}
 
@@ -34,7 +43,7 @@ class _OutOfStep(DeviceError):
 
 
 class ModbusLightBank:
-    """Implements `LightBank` with pymodbus; see there for the contract.
+    """Implements `LightBank`; see there for the contract.
 
     After any trouble the link is closed. The next request opens it anew, drains it and identifies
     the bank before anything else is asked, so that no late answer is taken for a later one's.
@@ -42,7 +51,7 @@ class ModbusLightBank:
     """
 
     def __init__(self, config: ModbusTcpConfig | ModbusRtuConfig, lamps: int) -> None:
-        _check_apart(config.registers, lamps)
+        check_apart(config.registers, lamps)
         port = config.port
         place = port if isinstance(config, ModbusRtuConfig) else f"{config.host}:{port}"
         self.name = f"light bank ({place})"
@@ -62,6 +71,7 @@ class ModbusLightBank:
         self._identified = False
         self._out_of_step = False
         self._falls = 0
+        self._echo_logged = False
         self._lock = threading.RLock()
 
     def connect(self) -> None:
@@ -76,7 +86,7 @@ class ModbusLightBank:
     def close(self) -> None:
         with self._lock:
             if self._link is not None:
-                self._link.close()  # type: ignore[no-untyped-call]  # pymodbus's own
+                self._link.close()
             self._link = self._level = self._armed = None
             self._identified = False
 
@@ -157,9 +167,9 @@ class ModbusLightBank:
                 held, *words = self._read("read_holding_registers", first, OWNER_WORDS, doing)
                 if held in (0, number):
                     raise
-                return _text(words) or f"a service that gave no name ({held})"
+                return text_of(words) or f"a service that gave no name ({held})"
             if number:
-                self._exchange(doing, "write_registers", first + 1, _words(name))
+                self._exchange(doing, "write_registers", first + 1, words_of(name))
             self._owner = number
         return None
 
@@ -264,7 +274,7 @@ class ModbusLightBank:
     def _read(self, method: str, address: int, count: int, doing: str) -> list[int]:
         with self._lock:
             self._trust()
-            return list(self._exchange(doing, method, address, count).registers)
+            return frames.registers(self._exchange(doing, method, address, count))
 
     def _trust(self) -> None:
         """Have an open link to the right bank on which no answer is late."""
@@ -274,6 +284,7 @@ class ModbusLightBank:
             self._open("connecting")
             try:
                 self._fall_into_step()
+                self._log_echo()
                 break
             except _OutOfStep:
                 if attempt == _ATTEMPTS_TO_FALL_INTO_STEP:
@@ -293,23 +304,28 @@ class ModbusLightBank:
             count = 1 + 8 * self._falls % min(self.count, MOST_COILS)
             self._exchange(doing, "read_coils", self._map.coils, count)
 
+    def _log_echo(self) -> None:
+        if self._link is not None and self._link.echoes and not self._echo_logged:
+            self._echo_logged = True
+            log.warning("%s: the adapter echoes what is sent; the echoes are dropped", self.name)
+
     def _identify(self) -> None:
         r, doing = self._map, "identifying"
         if r.signature is not None:
             address, wanted = r.signature
-            got = self._exchange(doing, "read_input_registers", address, 1).registers[0]
+            (got,) = frames.registers(self._exchange(doing, "read_input_registers", address, 1))
             if got != wanted:
                 expected = f"input register {address} to be {wanted:#06x}"
                 todo = "Check port and unit in [devices.lights]: this is another device."
                 raise self._error(doing, expected, f"{got:#06x}", todo)
         if r.count is not None:
-            lamps = self._exchange(doing, "read_input_registers", r.count, 1).registers[0]
+            (lamps,) = frames.registers(self._exchange(doing, "read_input_registers", r.count, 1))
             if lamps != self.count:
                 expected = f"{self.count} lamps as in the rig file"
                 raise self._error(doing, expected, f"{lamps}", "Use the rig file of this stage.")
         if r.sequence is not None:
             answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)
-            self._armed = answer.registers[0]
+            (self._armed,) = frames.registers(answer)
 
     def _open(self, doing: str) -> None:
         if self._link is not None:
@@ -327,36 +343,57 @@ class ModbusLightBank:
                 self.name, doing, "a connection", f"none ({error})", todo, self.config.timeout_s
             ) from error
 
-    def _exchange(self, doing: str, method: str, address: int, payload: Any) -> Any:
-        """One request: `payload` is the count of a read, else the value or values to write."""
-        link: Any = self._link
-        more = {"count": payload} if method.startswith("read") else {}
-        values = () if more else (payload,)
+    def _exchange(
+        self, doing: str, method: str, address: int, payload: int | Sequence[int]
+    ) -> bytes:
+        """One request: `payload` is the count of a read, else what is written, a number alone for
+        "write_register". Returns the right answer, without its frame."""
+        assert self._link is not None
+        asked = frames.request(method, address, payload)
         try:
-            answer = getattr(link, method)(address, *values, device_id=self.config.unit, **more)
-        except (ModbusException, OSError) as error:
-            self.close()
-            lost = isinstance(error, OSError)
-            kind = DeviceUnreachable if lost else DeviceTimeout
-            got = f"none ({error})" if lost else modbus_answers.unusable(link.received)
-            dark = self.capabilities.dead_man
-            left = "its watchdog puts the lamps off" if dark else "its lamps may still be lit"
-            todo = f"Check power and cable of the bank; {left}."
-            raise kind(self.name, doing, "an answer", got, todo, self.config.timeout_s) from error
-        wanted = modbus_answers.expected(method, address, payload)
-        got = modbus_answers.received(answer)
-        if answer.function_code == modbus_answers.CODES[method] | 0x80:
-            code = answer.exception_code
+            answer = self._link.ask(asked)
+        except (Unanswered, OSError) as error:
+            raise self._unanswered(doing, error) from error
+        except NotTheAnswer as other:
+            raise self._other_answer(
+                doing, f"{frames.expected(asked)}, {other.expected}", other
+            ) from other
+        if answer[0] == asked[0] | frames.EXCEPTION and len(answer) == frames.EXCEPTION_SIZE:
+            code = answer[1]
             received = f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})"
             todo = "Check the registers in [devices.lights]; 4 also says that a sequence is armed."
             raise self._error(doing, "an answer", received, todo)
-        if got != wanted:
-            self.close()
-            self._out_of_step = True
-            todo = "Answers were out of step; the next request opens the link anew. If it "
-            todo += "happens again, look for a second master."
-            raise _OutOfStep(self.name, doing, f"the answer {wanted}", f"{got}", todo)
+        if not frames.is_right(asked, answer):
+            raise self._other_answer(doing, frames.expected(asked), frames.shown(answer))
         return answer
+
+    def _unanswered(self, doing: str, error: Unanswered | OSError) -> DeviceError:
+        """What to raise where no answer came; the link is closed."""
+        self.close()
+        left = "its watchdog puts the lamps off"
+        if not self.capabilities.dead_man:
+            left = "its lamps may still be lit"
+        todo = f"Check power and cable of the bank; {left}."
+        timeout_s = self.config.timeout_s
+        if isinstance(error, OSError):
+            got = f"none ({error})"
+            return DeviceUnreachable(self.name, doing, "an answer", got, todo, timeout_s)
+        got = frames.unusable(error.received)
+        if error.echo:
+            got = "its own request alone, which comes back"
+            if isinstance(self.config, ModbusRtuConfig):
+                todo += f" The adapter on {self.config.port} echoes: switch its local echo off."
+            else:
+                todo = f"What listens there is no light bank: check host and port; {left}."
+        return DeviceTimeout(self.name, doing, "an answer", got, todo, timeout_s)
+
+    def _other_answer(self, doing: str, expected: str, received: object) -> _OutOfStep:
+        """What to raise for an answer to something else; the link is closed."""
+        self.close()
+        self._out_of_step = True
+        todo = "Answers were out of step; the next request opens the link anew. If it "
+        todo += "happens again, look for a second master."
+        return _OutOfStep(self.name, doing, f"the answer {expected}", f"{received}", todo)
 
     def _required(self, address: int | None, doing: str, what: str) -> int:
         if address is None:
@@ -365,32 +402,3 @@ class ModbusLightBank:
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
         return DeviceError(self.name, doing, expected, received, todo)
-
-
-def _check_apart(registers: LightRegisters, lamps: int) -> None:
-    """Raise `RigError` where two holding registers share an address: the level of lamp 1000,
-    written where the selector is, would be a command."""
-    many = {"levels": lamps, "owner": OWNER_WORDS, "table": 2 * TABLE_ENTRIES}
-    found: dict[int, str] = {}
-    for name in ("levels", "selector", "heartbeat", "watchdog", "sequence", "owner", "table"):
-        first = getattr(registers, name)
-        for address in () if first is None else range(first, first + many.get(name, 1)):
-            if (other := found.setdefault(address, name)) != name:
-                raise RigError(
-                    f"devices.lights.registers: {name} lies over {other} at {address}, with "
-                    f"{lamps} lamps: give each addresses of its own, as the bank has them"
-                )
-
-
-def _words(name: str) -> list[int]:
-    """A name as the registers behind the owner's number: two characters each, then zeros."""
-    data = name.encode("ascii", "replace")[: 2 * (OWNER_WORDS - 1)].ljust(
-        2 * (OWNER_WORDS - 1), b"\0"
-    )
-    return [data[i] << 8 | data[i + 1] for i in range(0, len(data), 2)]
-
-
-def _text(words: list[int]) -> str:
-    """The name in these registers."""
-    data = b"".join(word.to_bytes(2, "big") for word in words).partition(b"\0")[0]
-    return "".join(c if c.isprintable() else "?" for c in data.decode("ascii", "replace"))

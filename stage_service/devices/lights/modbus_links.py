@@ -1,22 +1,48 @@
-"""pymodbus clients that keep one strict deadline a request, on TCP and on RTU."""
+"""Modbus links, TCP and RTU: one request at a time, one strict deadline each, every byte looked at.
+
+On an RS-485 line the adapter may hear its own request (a local echo), which looks like the answer
+to a write of one register. So a line is known to echo, or not to, from a read, whose echo looks
+like no answer to it; the driver reads before it believes the answer to any write.
+"""
 
 from __future__ import annotations
 
 import os
 import select
 import socket
+import struct
 import termios
 import time
-from typing import Any
-
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from abc import ABC, abstractmethod
 
 from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.devices.lights import modbus_frames as frames
 from stage_service.devices.serial_ports import ExclusivePort
 
 _FASTEST_FIXED = 19200
 _SILENCE_S = 1.75e-3
 _MOST_DRAINED = 100
+_NOISE = b"\0\xff"
+"""What an RS-485 line that changes direction reads as: addresses that no unit may have."""
+_ECHO_S = 0.05
+"""An answer that may be the echo of its request is waited for so long behind that."""
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol, bytes that follow, unit
+
+
+class Unanswered(Exception):
+    """No answer came; `received` did before the deadline, `echo`: the request and no more."""
+
+    def __init__(self, received: bytes, echo: bool = False) -> None:
+        super().__init__(frames.unusable(received))
+        self.received, self.echo = received, echo
+
+
+class NotTheAnswer(Exception):
+    """An answer to something else, or with something around it; both in words."""
+
+    def __init__(self, expected: str, received: str) -> None:
+        super().__init__(received)
+        self.expected, self.received = expected, received
 
 
 def silence_s(config: ModbusRtuConfig) -> float:
@@ -32,105 +58,177 @@ def character_s(config: ModbusRtuConfig) -> float:
     return (9 + (config.parity != "N") + config.stop_bits) / config.baud
 
 
-class _Deadline:
-    """Receiving for pymodbus, which itself polls with sleeps of a millisecond and may wait twice.
-    `received` is what came since the last request.
+class ModbusLink(ABC):
+    """An open link; making one raises `OSError` with the reason.
 
-    retries=0: a command that is repeated unseen would hide a failing link, and the default of
-    three multiplies every deadline by four.
+    `echoes`: whether requests come back before their answers; None: not known yet, and the answer
+    to a write of one register may be an echo.
     """
 
-    socket: Any
-    received = b""
-    _deadline = 0.0
+    echoes: bool | None = None
 
-    def _sent(self, timeout_s: float) -> None:
-        self.received = b""
-        self._deadline = time.monotonic() + timeout_s
+    @abstractmethod
+    def ask(self, request: bytes) -> bytes:
+        """The answer to a request, both without frames: a right one, an exception, or one of
+        another function or content. Raises `Unanswered`, `NotTheAnswer`, `OSError`."""
 
-    def recv(self, size: int | None) -> bytes:
-        """What there is, as soon as there is any; nothing after the deadline."""
-        descriptor = self.socket.fileno()
-        wait = self._deadline - time.monotonic()
-        if wait <= 0 or not select.select([descriptor], [], [], wait)[0]:
-            return b""
-        data = os.read(descriptor, 4096)
-        if not data:
-            raise ConnectionResetError("the other end closed the connection")
-        self.received += data
-        return data
+    @abstractmethod
+    def drain(self, quiet_s: float) -> None:
+        """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it."""
 
 
-class _TcpLink(_Deadline, ModbusTcpClient):
+class TcpLink(ModbusLink):
+    """On TCP, where nothing may come that is not the answer."""
+
+    echoes = False
+
     def __init__(self, config: ModbusTcpConfig) -> None:
-        super().__init__(config.host, port=config.port, timeout=config.timeout_s, retries=0)
         self._config = config
+        self._transaction = 0
+        self._socket = socket.create_connection((config.host, config.port), config.timeout_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def connect(self) -> bool:
-        if self.socket is None:
-            address = (self._config.host, self._config.port)
-            self.socket = socket.create_connection(address, self._config.timeout_s)
-            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return True
-
-    def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:
-        self._sent(self._config.timeout_s)
-        self.socket.sendall(request)
-        return len(request)
+    def close(self) -> None:
+        self._socket.close()
 
     def drain(self, quiet_s: float) -> None:
         """A new connection carries nothing old."""
 
+    def ask(self, request: bytes) -> bytes:
+        config = self._config
+        self._transaction = self._transaction % 0xFFFF + 1
+        deadline = time.monotonic() + config.timeout_s
+        early = _receive(self._socket.fileno(), 0.0)
+        sent = _HEADER.pack(self._transaction, 0, len(request) + 1, config.unit) + request
+        self._socket.sendall(sent)
+        if early:
+            raise NotTheAnswer("nothing before the request", frames.unusable(early))
+        came = b""
+        while (size := self._size(came, sent)) is None or len(came) < size:
+            if not (more := _receive(self._socket.fileno(), deadline - time.monotonic())):
+                raise Unanswered(came)
+            came += more
+        if len(came) > size:
+            raise NotTheAnswer("nothing behind it", frames.unusable(came[size:]))
+        return came[_HEADER.size :]
 
-class _RtuLink(_Deadline, ModbusSerialClient):
+    def _size(self, came: bytes, sent: bytes) -> int | None:
+        """Bytes of the whole answer that begins so, None where that is not known yet. Raises
+        `NotTheAnswer` for a header that is not of the answer, `Unanswered` for the request."""
+        request = sent[_HEADER.size :]
+        if not _echo_like_answer(request):
+            if came.startswith(sent):
+                raise Unanswered(came, echo=True)
+            if sent.startswith(came):
+                return None
+        if len(came) <= _HEADER.size:
+            return None
+        header = _HEADER.unpack_from(came)
+        exception = came[_HEADER.size] == request[0] | frames.EXCEPTION
+        size = frames.EXCEPTION_SIZE if exception else frames.right_size(request)
+        right = (self._transaction, 0, size + 1, self._config.unit)
+        if header != right:
+            raise NotTheAnswer(_shown(right), _shown(header))
+        return _HEADER.size + size
+
+
+class RtuLink(ModbusLink):
+    """On a serial line, where an adapter may echo, and noise may surround an answer."""
+
     def __init__(self, config: ModbusRtuConfig) -> None:
-        super().__init__(config.port, timeout=config.timeout_s, retries=0)
         self._config = config
         self._quiet_since = time.monotonic()
-
-    def connect(self) -> bool:
-        if self.socket is None:
-            try:
-                self.socket = ExclusivePort(
-                    self._config.port,
-                    self._config.baud,
-                    timeout_s=self._config.timeout_s,
-                    parity=self._config.parity,
-                    stop_bits=self._config.stop_bits,
-                )
-            except termios.error as error:
-                raise OSError(*error.args) from error
-        return True
-
-    def send(self, request: bytes, addr: tuple[Any, ...] | None = None) -> int:
-        time.sleep(max(0.0, self._quiet_since + silence_s(self._config) - time.monotonic()))
         try:
-            self.socket.reset_input_buffer()  # what is there belongs to an older request
+            self._port = ExclusivePort(
+                config.port,
+                config.baud,
+                timeout_s=config.timeout_s,
+                parity=config.parity,
+                stop_bits=config.stop_bits,
+            )
+        except termios.error as error:
+            raise OSError(*error.args) from error
+
+    def close(self) -> None:
+        self._port.close()
+
+    def drain(self, quiet_s: float) -> None:
+        for _ in range(_MOST_DRAINED):
+            if not self._more(quiet_s):
+                return
+
+    def ask(self, request: bytes) -> bytes:
+        config = self._config
+        sent = frames.with_crc(bytes([config.unit]) + request)
+        time.sleep(max(0.0, self._quiet_since + silence_s(config) - time.monotonic()))
+        try:
+            self._port.reset_input_buffer()  # what is there belongs to an older request
         except termios.error as error:
             raise OSError(*error.args) from error
         # The deadline is the device's: the time on the wire is on top.
-        self._sent(self._config.timeout_s + len(request) * character_s(self._config))
-        self.socket.write(request)
-        return len(request)
+        deadline = time.monotonic() + config.timeout_s + len(sent) * character_s(config)
+        self._port.write(sent)
+        came = b""
+        while (answer := self._answer(came, sent)) is None:
+            if not (more := self._more(deadline - time.monotonic())):
+                raise Unanswered(came, echo=came.strip(_NOISE) == sent.strip(_NOISE))
+            came += more
+        if self.echoes is None and answer == sent:  # or an echo, and the answer is still to come
+            self._more(_ECHO_S)
+        return answer[1:-2]
 
-    def drain(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
-        for _ in range(_MOST_DRAINED):
-            self._sent(quiet_s)
-            if not self.recv(None):
-                return
-
-    def recv(self, size: int | None) -> bytes:
-        data = super().recv(size)
+    def _more(self, within_s: float) -> bytes:
+        data = _receive(self._port.fileno(), within_s)
         self._quiet_since = time.monotonic()
         return data
 
-
-ModbusLink = _TcpLink | _RtuLink
+    def _answer(self, came: bytes, sent: bytes) -> bytes | None:
+        """The answer's frame in what came, None as long as there is none; learns whether the line
+        echoes, where that can be told. Raises `NotTheAnswer`."""
+        rest = came.lstrip(_NOISE)
+        could_be = _echo_like_answer(sent[1:])
+        echoed = rest.startswith(sent) and (self.echoes is True or not could_be)
+        if echoed and self.echoes is not False:
+            rest = rest[len(sent) :].lstrip(_NOISE)
+        elif self.echoes or echoed or (not could_be and sent.startswith(rest)):
+            return None
+        frame = frames.rtu_frame(rest)
+        if frame is None:
+            return None
+        behind = rest[len(frame) :].rstrip(_NOISE)
+        if behind and not (self.echoes is None and could_be):
+            raise NotTheAnswer("nothing behind it", frames.unusable(behind))
+        if frame[0] != self._config.unit:
+            raise NotTheAnswer(f"unit {self._config.unit}", f"unit {frame[0]}")
+        if self.echoes is None and not could_be and frames.is_right(sent[1:-2], frame[1:-2]):
+            self.echoes = echoed
+        return frame
 
 
 def open_link(config: ModbusTcpConfig | ModbusRtuConfig) -> ModbusLink:
     """An open link; raises `OSError` with the reason."""
-    link = _RtuLink(config) if isinstance(config, ModbusRtuConfig) else _TcpLink(config)
-    link.connect()
-    return link
+    return RtuLink(config) if isinstance(config, ModbusRtuConfig) else TcpLink(config)
+
+
+def _echo_like_answer(request: bytes) -> bool:
+    """Whether the right answer to it is the same: a write of one register is repeated."""
+    return request[0] == frames.CODES["write_register"]
+
+
+def _receive(descriptor: int, within_s: float) -> bytes:
+    """What there is, as soon as there is any; nothing where nothing came in time."""
+    if not select.select([descriptor], [], [], max(0.0, within_s))[0]:
+        return b""
+    data = os.read(descriptor, 4096)
+    if not data:
+        raise ConnectionResetError("the other end closed the connection")
+    return data
+
+
+def _shown(header: tuple[int, ...]) -> str:
+    transaction, protocol, length, unit = header
+    return f"transaction {transaction}, protocol {protocol}, length {length}, unit {unit}"

@@ -72,12 +72,14 @@ class PjLinkProjector:
 
     def power(self) -> Power:
         """The power state that it reports."""
-        return Power(int(self._ask("POWR ?", "[0-3]", "reading the power state")))
+        return Power(int(self._ask("POWR ?", "[0-3]", "0, 1, 2 or 3", "reading the power state")))
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Hours of each lamp; empty where it has none to count (ERR1)."""
         doing = "reading the lamp hours"
-        answer = self._ask("LAMP ?", r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1", doing)
+        pairs = r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1"
+        shown = "hours and 0 or 1 for each of up to 8 lamps"
+        answer = self._ask("LAMP ?", pairs, shown, doing)
         if answer == "ERR1":
             return ()
         words = answer.split(" ")
@@ -86,10 +88,11 @@ class PjLinkProjector:
 
     def switch(self, on: bool) -> None:
         """Ask for power on or standby. OK means accepted: `power` says when it is reached."""
-        self._ask(f"POWR {on:d}", "OK", f"switching the power {'on' if on else 'off'}")
+        self._ask(f"POWR {on:d}", "OK", "OK", f"switching the power {'on' if on else 'off'}")
 
-    def _ask(self, command: str, answer: str, doing: str) -> str:
-        """Send `command` and return what follows `=` in its answer, which is like `answer`."""
+    def _ask(self, command: str, answer: str, shown: str, doing: str) -> str:
+        """Send `command` and return what follows `=` in its answer: a match of the pattern
+        `answer`, which an error names as `shown`."""
         deadline = time.monotonic() + self.timeout_s
         try:
             with socket.create_connection((self.host, self.port), self.timeout_s) as link:
@@ -117,7 +120,7 @@ class PjLinkProjector:
         other = (repr(line), "Check that this is a PJLink port and nothing stands in between.")
         received, todo = _ERRORS[number[1]] if number else other
         kind = ProjectorBusy if number and number[1] == "3" else DeviceError
-        raise self._error(kind, doing, f"an answer like %1{command[:4]}={answer}", received, todo)
+        raise self._error(kind, doing, f"%1{command[:4]}= and {shown}", received, todo)
 
     def _digest(self, greeting: str, doing: str) -> str:
         """What goes in front of the first command: nothing, or the MD5 digest."""

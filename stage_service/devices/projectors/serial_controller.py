@@ -8,15 +8,21 @@ from collections.abc import Sequence
 from stage_service.config import PROJECTOR_LEVELS, SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
-from stage_service.devices.serial_lines import SerialLines
+from stage_service.devices.serial_lines import Identity, SerialLines
+
+IDENTITY = Identity(
+    "HAIRSTAGE-PROJECTORS",
+    re.compile(r"HAIRSTAGE-PROJECTORS (?:2 (\d+) )?(\S*)"),
+    "a projector controller: 'HAIRSTAGE-PROJECTORS 2', the entries that it holds and the "
+    "projectors' names, parted by commas, without blanks; or the names alone",
+)
 
 
 class SerialProjectorController:
     """Implements `ProjectorController`; see there for the contract."""
 
     def __init__(self, config: SerialConfig, expected: tuple[str, ...]) -> None:
-        identity = re.compile(r"HAIRSTAGE-PROJECTORS (?:2 (\d+) )?(\S*)")
-        self._lines = SerialLines("projector controller", config, identity)
+        self._lines = SerialLines("projector controller", config, IDENTITY)
         self._expected = expected
         self.names: tuple[str, ...] = ()
         self.capabilities = ProjectorCapabilities(reads_back=True, dead_man=False, table=0)
@@ -49,7 +55,7 @@ class SerialProjectorController:
         self._lines.echo("OFF", "putting the projectors dark")
 
     def is_dark(self) -> bool:
-        return self._lines.ask("SHOW?", "SHOW (.+)", "reading what is shown")[1] == "OFF"
+        return self._lines.ask("SHOW?", "SHOW <text>", "reading what is shown")[1] == "OFF"
 
     def load_sequence(self, patterns: Sequence[Pattern]) -> None:
         """Upload in runs of rows, compare checksum and number of patterns with our own, and leave
@@ -61,7 +67,7 @@ class SerialProjectorController:
     def position(self) -> int:
         """How often the gate has closed since the sequence was armed."""
         doing = "reading the sequence's position"
-        match = self._lines.ask("SEQ?", r"SEQ (armed|idle|watchdog) (\d+)", doing)
+        match = self._lines.ask("SEQ?", "SEQ <armed|idle|watchdog> <n>", doing)
         if match[1] != "armed":
             tripped = match[1] == "watchdog"
             received = f"{match[1]}, after {match[2]} patterns"
@@ -79,7 +85,7 @@ class SerialProjectorController:
 
     def heartbeat(self) -> None:
         """Any request counts; this one changes nothing."""
-        self._lines.ask("SHOW?", "SHOW .+", "feeding the watchdog")
+        self._lines.ask("SHOW?", "SHOW <text>", "feeding the watchdog")
 
 
 def _runs(patterns: Sequence[Pattern]) -> list[list[Pattern]]:

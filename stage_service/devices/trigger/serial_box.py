@@ -10,7 +10,7 @@ from typing import cast, get_args
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
-from stage_service.devices.serial_lines import SerialLines
+from stage_service.devices.serial_lines import Identity, SerialLines
 from stage_service.devices.trigger.interface import (
     Gates,
     TableProgress,
@@ -19,6 +19,11 @@ from stage_service.devices.trigger.interface import (
     TriggerStatus,
 )
 
+IDENTITY = Identity(
+    "HAIRSTAGE-TRIGGER",
+    re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 (\d+))"),
+    "a trigger box: 'HAIRSTAGE-TRIGGER 1', or 'HAIRSTAGE-TRIGGER 2' and its table rows",
+)
 MOST_REPEATS = 1_000_000
 LONGEST_US = {"settle": 1_000_000, "exposure": 10_000_000, "period": 60_000_000}
 
@@ -27,8 +32,7 @@ class SerialTriggerBox:
     """Implements `TriggerBox`; see there for the contract."""
 
     def __init__(self, config: SerialConfig) -> None:
-        identity = re.compile(r"HAIRSTAGE-TRIGGER (?:1|2 (\d+))")
-        self._lines = SerialLines("trigger box", config, identity)
+        self._lines = SerialLines("trigger box", config, IDENTITY)
         self.table_rows = 0  # version 1 of the box has none
         self.name = self._lines.name
 
@@ -42,16 +46,16 @@ class SerialTriggerBox:
     def pulse(self, exposure_s: float) -> int:
         """Fire all cameras once for 1 µs to 10 s; returns the count."""
         us = self._microseconds("exposure", exposure_s, 1)
-        return int(self._lines.ask(f"PULSE {us}", r"OK (\d+)", "firing the cameras")[1])
+        return int(self._lines.ask(f"PULSE {us}", "OK <n>", "firing the cameras")[1])
 
     def count(self) -> int:
-        return int(self._lines.ask("COUNT?", r"COUNT (\d+)", "reading the pulse count")[1])
+        return int(self._lines.ask("COUNT?", "COUNT <n>", "reading the pulse count")[1])
 
     def reset(self) -> None:
-        self._lines.ask("RESET", r"OK 0", "resetting the pulse count")
+        self._lines.ask("RESET", "OK 0", "resetting the pulse count")
 
     def status(self) -> TriggerStatus:
-        reply = r"STATUS interlock=([01]) estop=([01])"
+        reply = "STATUS interlock=<0|1> estop=<0|1>"
         match = self._lines.ask("STATUS?", reply, "reading the safety inputs")
         return TriggerStatus(match[1] == "1", match[2] == "1")
 
@@ -72,13 +76,13 @@ class SerialTriggerBox:
         self._lines.echo("GO", "starting the table")
 
     def progress(self) -> TableProgress:
-        reply = rf"SEQ ({'|'.join(get_args(TableState))}) (\d+) (\d+) ([a-z-]+)"
+        reply = f"SEQ <{'|'.join(get_args(TableState))}> <n> <n> <word>"
         match = self._lines.ask("SEQ?", reply, "reading the table's progress")
         # The pattern admits these states only.
         return TableProgress(cast("TableState", match[1]), int(match[2]), int(match[3]), match[4])
 
     def stop(self) -> int:
-        return int(self._lines.ask("STOP", r"OK STOP (\d+)", "stopping the table")[1])
+        return int(self._lines.ask("STOP", "OK STOP <n>", "stopping the table")[1])
 
     def _text(self, row: TableRow) -> str:
         if row.gates not in get_args(Gates):

@@ -76,6 +76,7 @@ class Bench:
         self.pulses = 0
         self.seen: list[str] = []
         self.link: Path | None = None
+        self.peer: Any = None
 
     def lit(self) -> list[int]:
         """The numbers of the lamps that give light."""
@@ -164,7 +165,7 @@ def _simulated(
     one = Bench(driver_for(config, lamps.count), lamps.power)
     one.lamps, one.faults = lamps, faults
     peer = light_bank(config, one, folder / "lights", ("127.0.0.1", 0), paced)
-    place = peer.start()
+    one.peer, place = peer, peer.start()
     stack.callback(peer.stop)
     if isinstance(place, int):
         assert isinstance(config, ModbusTcpConfig)

@@ -208,7 +208,7 @@ def test_an_answer_out_of_the_protocol_is_refused(answer: bytes) -> None:
         link.sendall(answer)
 
     port, thread = peer(answers)
-    with pytest.raises(DeviceError, match="expected an answer like %1POWR="):
+    with pytest.raises(DeviceError, match="expected %1POWR= and 0, 1, 2 or 3 within"):
         PjLinkProjector("front", "127.0.0.1", port).power()
     thread.join()
 
