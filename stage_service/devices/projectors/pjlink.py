@@ -77,9 +77,9 @@ class PjLinkProjector:
     def lamps(self) -> tuple[Lamp, ...]:
         """Hours of each lamp; empty where it has none to count (ERR1)."""
         doing = "reading the lamp hours"
-        pairs = r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1"
+        pattern = r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1"
         shown = "hours and 0 or 1 for each of up to 8 lamps"
-        answer = self._ask("LAMP ?", pairs, shown, doing)
+        answer = self._ask("LAMP ?", pattern, shown, doing)
         if answer == "ERR1":
             return ()
         words = answer.split(" ")

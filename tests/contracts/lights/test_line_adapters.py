@@ -71,7 +71,7 @@ def test_an_echo_without_a_bank_is_no_answer(bench):
 @pytest.mark.parametrize("call", ["select", "off", "heartbeat", "set_watchdog", "claim"])
 def test_a_bank_that_dies_behind_an_echo_has_accepted_nothing(bench, call):
     """Writes of one register, whose right answer is the request itself."""
-    one = bench(RTU, Fault("lights", "hang", 1), connect=False)
+    one = bench(RTU, Fault("lights", "hang", 1), connect=False, clock=lambda: 50.0)
     one.peer.stand_behind(ECHO)
     one.driver.connect()
     one.driver.select(5)
@@ -83,7 +83,7 @@ def test_a_bank_that_dies_behind_an_echo_has_accepted_nothing(bench, call):
 
 
 def test_a_line_that_begins_to_echo_as_its_bank_dies_is_not_dark(bench):
-    one = bench(RTU, Fault("lights", "hang", 1))
+    one = bench(RTU, Fault("lights", "hang", 1), clock=lambda: 50.0)  # its watchdog never trips
     one.driver.select(5)
     one.pulses = 1
     one.peer.stand_behind(ECHO)
