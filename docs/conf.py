@@ -18,8 +18,7 @@ myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = [
     "_build",
-    "reference/generated/rig_tables.md",
-    "reference/generated/model_files.md",
+    *(f"reference/generated/{part}.md" for part in generate.PARTS),
 ]
 """Built pages, and parts that pages include."""
 html_theme = "furo"

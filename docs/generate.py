@@ -10,13 +10,18 @@ import ast
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 from pydantic import BaseModel
 
+from appearance import HairAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction.model import FILES
+from reconstruction.report.report import LeftOut, Series, Stage
+from stage_service.acquisition.states import TRANSITIONS
 from stage_service.api.app import create_app
 from stage_service.api.problems import errors_page
 from stage_service.cli import build_parser
@@ -34,6 +39,18 @@ PYTHON = {
     ],
 }
 """Pages of the Python reference: stubs that list public names, or modules whose names all are."""
+MODEL_JSON: dict[str, tuple[Any, ...]] = {
+    "`appearance.json`": (FittedAppearance,),
+    "`appearance.json`, `hair`": (HairAppearance,),
+    "`report.json`, `stages`": (Stage,),
+    "`series` of a stage": (Series,),
+    "`left_out` of a stage": (LeftOut,),
+}
+"""The dataclasses whose fields are those of a JSON file."""
+
+
+PARTS = ("rig_tables", "model_files", "model_json", "states")
+"""Pages that others include."""
 
 
 def write_pages(folder: Path) -> None:
@@ -44,6 +61,8 @@ def write_pages(folder: Path) -> None:
         "http_api": http_page(openapi()),
         "errors": errors_page(),
         "rig_tables": rig_tables(),
+        "states": states(),
+        "model_json": model_json(),
         "model_files": "".join(f"- `{name}`: {text}\n" for name, text in FILES.items()),
         **{f"python_{name}": python_page(name, files) for name, files in PYTHON.items()},
     }
@@ -135,8 +154,7 @@ def _default(action: argparse.Action) -> str:
 
 def openapi() -> Mapping[str, Any]:
     """The document that the service has at /openapi.json."""
-    service: Any = SimpleNamespace(events=SimpleNamespace(), viewing=None)
-    return create_app(service).openapi()
+    return create_app(MagicMock()).openapi()  # no route is called
 
 
 def http_page(document: Mapping[str, Any]) -> str:
@@ -264,6 +282,29 @@ def _models(name: str, model: type[BaseModel]) -> str:
         text += f"(rig-{inner.lower()})=\n" if inner[0] != "[" else ""
         text += f"## {title}\n\n" if inner[0] == "[" else f"### {title}\n\n"
         text += _fields(part, "rig")
+    return text
+
+
+# Parts of pages
+
+
+def states() -> str:
+    """Every state of a capture and the actions that it allows."""
+    rows = (
+        (f"**{state}**", ", ".join(f"{action} → {after}" for action, after in actions.items()))
+        for state, actions in TRANSITIONS.items()
+    )
+    return table(("state", "action → next state"), rows)
+
+
+def model_json() -> str:
+    """The fields of a model's JSON files, from the classes that write them."""
+    text = ""
+    for name, kinds in MODEL_JSON.items():
+        for kind in kinds:
+            said = " ".join((kind.__doc__ or "").partition("Raises")[0].split())
+            listed = ", ".join(f"`{field.name}`" for field in fields(kind))
+            text += f"- {name}: {listed}. {said}\n"
     return text
 
 

@@ -8,7 +8,6 @@ import json
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -17,9 +16,6 @@ import pytest
 from benchmarks.__main__ import MODULES
 from benchmarks.publish import page_of
 
-from appearance import HairAppearance
-from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
-from reconstruction.report.report import LeftOut, Series, Stage
 from stage_service.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -137,18 +133,6 @@ def test_lines_of_the_pages_are_not_too_long(page: Path) -> None:
     most = [999 if line.startswith("|") or made else 120 for line in lines]
     long = [k for k, line in enumerate(lines) if len(line) > most[k]]
     assert [f"{k + 1}: {lines[k]}" for k in long] == []
-
-
-def test_the_fields_of_a_models_json_files_are_on_the_page() -> None:
-    page = (ROOT / "docs" / "reference" / "files.md").read_text()
-    records = {
-        "appearance.json": (FittedAppearance, Fibres, HairAppearance),
-        "report.json": (Stage, Series, LeftOut),
-    }
-    for name, kinds in records.items():
-        said = page.split(f"\n- `{name}`: `")[1].split("\n- ")[0]
-        names = {field.name for kind in kinds for field in fields(kind)}
-        assert names - set(CODE.findall("`" + said)) == set(), name
 
 
 def test_a_page_of_figures_is_what_its_json_says() -> None:

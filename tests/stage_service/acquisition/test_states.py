@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -78,10 +77,3 @@ def test_a_failure_while_finishing_wins():
     for action in ("start", "complete", "fail", "finish"):
         machine.do(action)
     assert machine.outcome == "failed"
-
-
-def test_the_documentation_has_the_same_transitions():
-    text = (Path(__file__).resolve().parents[3] / "docs" / "explanation" / "capture.md").read_text()
-    for state, actions in TRANSITIONS.items():
-        cell = ", ".join(f"{action} → {after}" for action, after in actions.items())
-        assert f"- **{state}**: {cell}\n" in text
