@@ -33,6 +33,10 @@ PYTHON = {
     "reconstruction": ["reconstruction/__init__.pyi"],
     "appearance": ["appearance/__init__.pyi"],
     "stage_service": ["stage_service/__init__.pyi"],
+    "evaluation": [
+        "reconstruction/evaluation/assessment.py",
+        "reconstruction/evaluation/matching.py",
+    ],
     "devices": [
         f"stage_service/devices/{kind}/interface.py"
         for kind in ("lights", "trigger", "projectors", "cameras")
@@ -313,9 +317,8 @@ def model_json() -> str:
 
 def python_page(title: str, files: list[str]) -> str:
     """Public names with signatures and docstrings, read without importing anything."""
-    name = f"`{title}`" if title in PYTHON and title != "devices" else "Device interfaces"
     module = ROOT / title / "__init__.py"
-    text = f"# {name}\n\n"
+    text = f"# Python: {title}\n\n"
     if module.exists():
         text += (ast.get_docstring(ast.parse(module.read_text())) or "") + "\n\n"
     for file in files:
