@@ -17,6 +17,9 @@ export let pressed = JSON.parse(sessionStorage.getItem(PRESSED) ?? "null");
 /** The right to send Blackout alone, without a login; null: this browser has none. */
 export const right = () => localStorage.getItem(RIGHT);
 
+/** The header that carries it: it darkens, and a login with it does not wait for others' wrong ones. */
+export const rightHeader = () => (right() ? { "Hairstage-Blackout": right() } : {});
+
 /** Keep the right that a login's answer has in `blackout`. */
 export function keepRight({ blackout: value }) {
   if (value) localStorage.setItem(RIGHT, value);
@@ -56,8 +59,7 @@ async function send() {
   for (;;) {
     const room = setTimeout(() => tell("yield all"), YIELD_MS);
     try {
-      const held = right();
-      const more = { patience: PATIENCE_MS, priority: "high", headers: held ? { "Hairstage-Blackout": held } : {} };
+      const more = { patience: PATIENCE_MS, priority: "high", headers: rightHeader() };
       const { safe, detail } = await ask("POST /devices/blackout", undefined, more);
       put({ at: pressed.at, answer: { at: Date.now(), safe, detail: local(detail) } });
       break;

@@ -1,7 +1,7 @@
 // The form that takes a token; the page around it keeps its Blackout.
 
 import { ask, get } from "./ask.js";
-import { keepRight } from "./blackout.js";
+import { keepRight, rightHeader } from "./blackout.js";
 import { h, say } from "./dom.js";
 
 /** Put the form into `view`. The page is loaded anew once it, or another of this browser, has logged in. */
@@ -12,7 +12,7 @@ export function loginForm(view) {
   view.replaceChildren(h("form.login", { onsubmit: async (event) => {
     event.preventDefault();
     try {
-      keepRight(await ask("POST /login", { token: token.value.trim() }));
+      keepRight(await ask("POST /login", { token: token.value.trim() }, { headers: rightHeader() }));
       location.reload();
     } catch (error) {
       say(wrong, error.message);

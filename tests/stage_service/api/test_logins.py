@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,8 @@ from waiting import until
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
+from stage_service.cli.stage import processes
+from stage_service.cli.support.commands import Output
 from stage_service.config import RigFile
 from stage_service.records import logins
 from stage_service.records.logins import Logins
@@ -38,15 +41,19 @@ def tokens(tmp_path: Path) -> Tokens:
 
 
 @pytest.fixture
-def started(rig_file: RigFile, tmp_path: Path, tokens: Tokens) -> Callable[..., Any]:
-    """`with started() as ask`: a service of the root folder, as a start has it."""
+def started(
+    rig_file: RigFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
+    """`with started() as ask`: a service of the root folder, as `hairstage serve` starts it."""
+    (tmp_path / "token").write_text("mine")
+    monkeypatch.setenv("HAIRSTAGE_TOKEN_FILE", str(tmp_path / "token"))
+    args = argparse.Namespace(no_auth=False, root=tmp_path / "root")
 
     @contextmanager
     def start() -> Iterator[Ask]:
-        root = tmp_path / "root"
-        service = Service(rig_file, root)
-        app = create_app(service, Access(tokens, logins=Logins(root)))
+        service = Service(rig_file, tmp_path / "root")
         service.take_stage()
+        app = create_app(service, processes._access(args, set(), Output(as_json=False)))
         try:
             yield lambda what, headers=(), **more: send(app, what, dict(headers), **more)
         finally:
