@@ -24,16 +24,19 @@ class Leasing:
         return LeaseView(holder=held.holder, expires=held.expires)
 
     def take(self, request: LeaseRequest, by: Caller) -> LeaseGrant:
-        """Steer alone for some time. Raises `Leased`."""
+        """Steer alone for some time. Raises `Leased`, `NotRecorded`."""
         work = partial(self._control.leases.take, request.holder, request.seconds)
         detail = f"{request.holder}, {request.seconds:g} s"
-        return self._granted(self._control.do(by, "lease.take", work, detail=detail, steers=False))
+        lease = self._control.do(by, "lease.take", work, detail=detail, steers=False)
+        return self._granted(lease, lease.token)
 
     def renew(self, request: RenewRequest, by: Caller) -> LeaseGrant:
-        """Let the caller's lease end so many seconds from now. Raises `NoLease`."""
-        work = partial(self._control.leases.renew, by.token or "", request.seconds)
+        """Let the caller's lease end so many seconds from now. Raises `NoLease`, `NotRecorded`."""
+        token = by.token or ""
+        work = partial(self._control.leases.renew, token, request.seconds)
         detail = f"{request.seconds:g} s"
-        return self._granted(self._control.do(by, "lease.renew", work, detail=detail, steers=False))
+        lease = self._control.do(by, "lease.renew", work, detail=detail, steers=False)
+        return self._granted(lease, token)
 
     def release(self, by: Caller) -> LeaseView:
         """End the caller's lease. Raises `Forbidden`, `NoLease`."""
@@ -51,9 +54,9 @@ class Leasing:
         self._control.do(by, "lease.end", work, detail=detail, steers=False)
         return self._tell()
 
-    def _granted(self, lease: Lease) -> LeaseGrant:
+    def _granted(self, lease: Lease, token: str) -> LeaseGrant:
         self._tell()
-        return LeaseGrant(token=lease.token, holder=lease.holder, expires=lease.expires)
+        return LeaseGrant(token=token, holder=lease.holder, expires=lease.expires)
 
     def _tell(self) -> LeaseView:
         view = self.view()

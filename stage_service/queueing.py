@@ -12,29 +12,31 @@ from reconstruction.options import sentence
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import CaptureQueue, Entry
 from stage_service.captures.control import Caller, Control
-from stage_service.captures.manager import Busy, CaptureManager
+from stage_service.captures.manager import CaptureManager
+from stage_service.captures.may_light import Word
 from stage_service.inputs import BadInput
 from stage_service.plan.resolved import resolve
 from stage_service.service_models import CaptureRequest, QueueRequest, QueueView
 
-Prepare = Callable[[QueueRequest, str | None], Callable[..., str]]
+Prepare = Callable[[QueueRequest], Callable[..., str]]
 
 
 class Queueing:
     """Who may change what waits for the stage, and when the stage takes it.
 
-    `prepare(request, armed_by)` is what starts a capture. Nothing begins by itself while another
-    capture runs, the stage is latched or not known to be dark, or somebody holds the lease; after a
-    blackout, an acknowledgement, an abort, or a capture that did not complete, somebody has to say
-    that it may go on.
+    `prepare(request)` is what starts a capture, on a word. What keeps an entry from beginning by
+    itself is in the table of `may_light`; while the queue is held, a person who has read why has to
+    say that it may go on.
     """
 
     def __init__(
         self, path: Path, captures: CaptureManager, control: Control, prepare: Prepare
     ) -> None:
         self._captures, self._control, self._prepare = captures, control, prepare
-        self._line = CaptureQueue(path, captures.events, self._begin, self._stage_waits_for)
-        self._judged: CaptureStatus | None = None
+        self._hold = captures.hold
+        self._line = CaptureQueue(
+            path, captures.events, self._begin, captures.waits_for, captures.hold
+        )
 
     def start(self, known: Sequence[CaptureStatus]) -> None:
         """Begin what waits; `known` are the captures on the disk."""
@@ -48,9 +50,13 @@ class Queueing:
 
     def view(self) -> QueueView:
         """What waits for the stage."""
-        line = self._line
-        waits_for = line.waits_for()
-        return QueueView(held=line.held, waits_for=waits_for, waiting=line.waiting())
+        line, held = self._line, self._hold.current
+        return QueueView(
+            held=None if held is None else held.text,
+            hold=held,
+            waits_for=line.waits_for(),
+            waiting=line.waiting(),
+        )
 
     def history(self, limit: int) -> list[Entry]:
         """What was started, or removed; the newest first."""
@@ -61,7 +67,7 @@ class Queueing:
         where one is needed) as starting it would, `Forbidden`, `QueueFull`."""
         if request.pipeline is not None:
             by.require("jobs")
-        self._prepare(request, None)
+        self._prepare(request)
         plan = resolve(request.plan, self._captures.rig_file)
         plan.check_flashing(armed_by="whoever starts it")
         kept = request.model_dump(mode="json", exclude={"place"}, exclude_defaults=True)
@@ -82,63 +88,43 @@ class Queueing:
     def start_one(self, entry: str, by: Caller, armed_by: str | None) -> Entry:
         """Start what waits now, out of turn, held or not; armed where it flashes. Raises
         `UnknownEntry`, `Forbidden`, and what starting a capture does."""
-        if armed_by is not None:
-            by.require("arm")
-
-        def begin(waiting: Entry) -> str:
-            return self._shoot(waiting, armed_by, self._captures.blackouts)
-
-        work = partial(self._line.begin, entry, begin)
-        started = self._control.do(by, "queue.start", work, entry)
-        self._control.record_arming(by, str(started.capture), armed_by)
-        return started
+        word = self._control.word(by, "entry", armed_by)
+        work = partial(self._line.begin, entry, partial(self._shoot, word=word))
+        return self._control.do(by, "queue.start", work, entry)
 
     def hold(self, why: str) -> None:
-        """Begin nothing by itself any more, where anything waits; asks neither disk nor device."""
-        self._line.hold(why)
+        """Begin nothing by itself any more; waits for neither disk nor device."""
+        self._hold.set(why)
 
     def hold_by(self, by: Caller) -> QueueView:
         """Begin nothing by itself any more; anybody may."""
-        work = partial(self._line.hold, f"by {by}", always=True)
+        work = partial(self._hold.set, f"by {by}")
         self._control.do(by, "queue.hold", work, "queue", steers=False)
         return self.view()
 
-    def go_on(self, by: Caller) -> QueueView:
-        """Begin what waits again. Raises `Leased`."""
-        self._control.do(by, "queue.go_on", self._line.go_on, "queue")
+    def go_on(self, hold: str, by: Caller) -> QueueView:
+        """End the hold of this id, which the caller has read. Raises `HoldChanged`, `Leased`."""
+        held = self._hold.current
+        detail = "" if held is None else f"was held: {held.text}"
+        work = partial(self._hold.release, hold)
+        self._control.do(by, "queue.go_on", work, "queue", detail=detail)
         self._captures.forget_death()
         return self.view()
 
     def _begin(self, entry: Entry) -> str:
-        since = self._captures.blackouts  # before `held`: a blackout holds first
-        if self._line.held is not None:
-            raise Busy("none, but the queue was held meanwhile")
-        return self._shoot(entry, None, since)
+        who, now = f"the queue, for {entry.by}", self._captures.moment()
+        return self._shoot(entry, Word("queue", who=who, given=now))
 
-    def _shoot(self, entry: Entry, armed_by: str | None, since: int) -> str:
+    def _shoot(self, entry: Entry, word: Word) -> str:
         try:
             request = QueueRequest.model_validate(entry.request)
         except ValidationError as error:
             told = f"{entry.id} is what another version could shoot: {sentence(error)}"
             raise BadInput(told) from error
-        capture = self._prepare(request, armed_by)(since, queue=entry.id)
+        capture = self._prepare(request)(word, queue=entry.id)
         who = f"the queue, for {entry.by}"
         self._control.audit.record(who, "capture.start", capture, detail=then(request))
         return capture
-
-    def _stage_waits_for(self) -> str | None:
-        reason = self._captures.waits_for()
-        if unread := self._captures.catalogue.unread:
-            reason = f"the captures on the disk are still being read: {unread:,} to come"
-        ended = self._captures.ended
-        if ended is not None and ended is not self._judged:
-            self._judged = ended
-            if ended.outcome != "completed":
-                self._line.hold(f"capture {ended.id}: {ended.outcome}")
-        lease = self._control.leases.current
-        if reason is None and lease is not None:
-            reason = f"{lease.holder} steers the stage until {lease.expires}"
-        return reason
 
 
 def then(request: CaptureRequest | QueueRequest) -> str:

@@ -20,6 +20,7 @@ from stage_service.calibrating import BoardView, Calibrating, CalibrationView
 from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import CaptureManager
+from stage_service.captures.may_light import Moment, Word
 from stage_service.captures.snapshots import SNAPSHOT, one_step
 from stage_service.config import RigFile
 from stage_service.frames import UnknownFrame, read_frame, steps_of
@@ -83,7 +84,7 @@ class Service:
             rig_file, root, on_complete=self._completed, take_over=take_over
         )
         self._has_stage = False
-        self._control = Control(self._captures.audit)
+        self._control = Control(self._captures.audit, self._captures.leases)
         self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
         self._queue = JobQueue(root, gpu_workers=gpu_workers)
         self._follower = JobFollower(root, self._queue, self._captures.events, self._captures.audit)
@@ -136,6 +137,10 @@ class Service:
         self.queue.start(known)
         self.events.publish("captures.read", {"count": len(known)})
 
+    def moment(self) -> Moment:
+        """When a request comes: no blackout after it is undone by what it asks for."""
+        return self._captures.moment()
+
     @property
     def unread(self) -> int:
         """Captures on the disk that are not listed yet."""
@@ -170,20 +175,16 @@ class Service:
     def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
         """Begin a capture. Raises `BadInput`, `Leased`, and what `CaptureManager.start` raises;
         `Forbidden` for a pipeline without the scope "jobs", or arming without "arm"."""
-        if request.armed_by is not None:
-            by.require("arm")
+        word = self._control.word(by, "capture", request.armed_by)
         if request.pipeline is not None:
             by.require("jobs")
-        work = self._prepared(request, request.armed_by)
+        work = partial(self._prepared(request), word)
         capture = self._control.do(by, "capture.start", work, None, detail=then(request))
-        self._control.record_arming(by, capture, request.armed_by, request.plan.consent)
         return self.capture(capture)
 
-    def _prepared(
-        self, request: CaptureRequest | QueueRequest, armed_by: str | None = None
-    ) -> Callable[..., str]:
-        """What starts the capture, its head and masks read. Raises `BadInput`, `NotThere`,
-        `NoStage`."""
+    def _prepared(self, request: CaptureRequest | QueueRequest) -> Callable[..., str]:
+        """What starts the capture on a word, its head and masks read. Raises `BadInput`,
+        `NotThere`, `NoStage`."""
         _ = self._captures.stage.devices  # of no use without: what waits would wait for ever
         given, folder = request.head, request.masks
         if request.upload is not None:
@@ -198,14 +199,10 @@ class Service:
         masks = read_masks(folder, self.rig_file.rig) if folder is not None else None
         asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
 
-        def start(unless_dark_since: int | None = None, **more: str) -> str:
+        def start(word: Word, **more: str) -> str:
+            extra = {**asked, **more}
             return self._captures.start(
-                request.plan,
-                armed_by=armed_by,
-                head=head,
-                masks=masks,
-                extra={**asked, **more},
-                unless_dark_since=unless_dark_since,
+                request.plan, head=head, masks=masks, extra=extra, word=word
             )
 
         return start
@@ -229,7 +226,8 @@ class Service:
         """Begin one exposure to look at: the capture "snapshot", which the next one replaces.
         Raises `PlanError`, `Busy`, `Unsafe`, `Leased`."""
         plan = one_step(self.rig_file, request.light, request.exposure, request.level)
-        work, detail = partial(self._captures.snapshot, plan), request.light or "all lights"
+        word, detail = self._control.word(by, "snapshot"), request.light or "all lights"
+        work = partial(self._captures.snapshot, plan, word)
         return self._view(self._control.do(by, "snapshot", work, SNAPSHOT, detail=detail))
 
     def pause(self, capture_id: str, by: Caller) -> CaptureView:
@@ -240,12 +238,10 @@ class Service:
     def resume(self, capture_id: str, by: Caller, armed_by: str | None = None) -> CaptureView:
         """Go on after a pause; of a capture that did not complete, shoot the frames it lacks.
         Raises `Forbidden` for arming without the scope "arm"."""
-        if armed_by is not None:
-            by.require("arm")
-        work = partial(self._captures.resume, capture_id, armed_by=armed_by)
+        word = self._control.word(by, "resume", armed_by)
+        work = partial(self._captures.resume, capture_id, word)
         status = self._control.do(by, "capture.resume", work, capture_id)
         self._verifier.forget(capture_id)  # what was found wrong may be what is shot now
-        self._control.record_arming(by, capture_id, armed_by)
         return self._view(status)
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:

@@ -13,6 +13,7 @@ from reconstruction.capture.folder import StepKind
 from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import Entry
+from stage_service.captures.hold import Held
 from stage_service.captures.latch import Latched
 from stage_service.config import (
     CaptureDefaults,
@@ -26,12 +27,14 @@ from stage_service.config import (
 )
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.person_text import LINES, ONE_LINE
+from stage_service.records.lease import LONGEST_LEASE_S
 
 FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$"
 FileName = Annotated[str, Field(pattern=FILE_NAME)]
-PersonName = Annotated[str, Text, Field(min_length=1, max_length=100)]
+PersonName = Annotated[str, Text, Field(min_length=1, max_length=100), ONE_LINE]
 Place = Annotated[int, Field(ge=0, le=10**6)]
-LeaseSeconds = Annotated[float, Field(ge=1.0, le=86400.0)]
+LeaseSeconds = Annotated[float, Field(ge=1.0, le=LONGEST_LEASE_S)]
 
 
 class _Wanted(Strict):
@@ -122,6 +125,14 @@ class CalibrationRequest(Strict):
     keep_lens: bool = False
 
 
+class GoOnRequest(Strict):
+    """`hold`: the id of the queue's hold that the caller has read; it changes with each reason."""
+
+    model_config = with_example(hold="3f9ac2d1")
+
+    hold: Annotated[str, Field(min_length=1, max_length=100)]
+
+
 class MoveRequest(Strict):
     """Where in the queue, from 0."""
 
@@ -160,8 +171,8 @@ class RenewRequest(Strict):
 class AcknowledgeRequest(Strict):
     """Who looked at the stage, and what they saw."""
 
-    name: Annotated[str, Text, Field(min_length=2, max_length=100)]
-    note: Annotated[str, Text, Field(min_length=4, max_length=2000)]
+    name: Annotated[str, Text, Field(min_length=2, max_length=100), ONE_LINE]
+    note: Annotated[str, Text, Field(min_length=4, max_length=2000), LINES]
 
 
 class CaptureView(CaptureStatus):
@@ -192,11 +203,13 @@ class CaptureView(CaptureStatus):
 class QueueView(BaseModel):
     """What waits for the stage, the next one first.
 
-    `held`: why nothing begins by itself until somebody says that it may go on; `waits_for`: what
-    the first one waits for now.
+    `held`: why nothing begins by itself until a person who has read it says that it may, by `POST
+    /queue:go-on` with the id of `hold`, which has the same reasons one by one, the newest first.
+    `waits_for`: what the first one waits for now.
     """
 
     held: str | None
+    hold: Held | None
     waits_for: str | None
     waiting: list[Entry]
 

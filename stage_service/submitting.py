@@ -27,6 +27,16 @@ class NotFinished(RuntimeError):
     """What was asked for needs a capture that completed."""
 
 
+class KeyUsed(RuntimeError):
+    """The caller has used this `Idempotency-Key` for another request."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(
+            f"your Idempotency-Key stands for {job.pipeline} on capture {Path(job.capture).name} "
+            f"(job {job.id}), and this request differs from it: send another key"
+        )
+
+
 class ModelInUse(RuntimeError):
     """Another job, queued or running, makes the same model."""
 
@@ -50,16 +60,36 @@ class Submitting:
         self.lock = threading.Lock()
 
     def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
-        """Enqueue a pipeline on a capture; where that was done under this `key`, it is that job.
-        Raises `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`."""
+        """Enqueue a pipeline on a capture; where the caller did that under this `key`, it is that
+        job. A key is its caller's, by the name of their token: another's is another key. Raises
+        `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`; `KeyUsed`
+        where the key stands for another request."""
         job = new_job_id()
         if key is not None:
-            job = f"job-{sha256(key.encode()).hexdigest()[:16]}"
+            own = sha256("\0".join((by.name, key)).encode())  # NUL is in neither
+            job = f"job-{own.hexdigest()[:16]}"
             with suppress(NoSuchJob):
-                return self._queue.get(job)
+                return self._same(self._queue.get(job), request)
         work = partial(self._submit, job, request)
         what = f"{request.pipeline.name} on {request.capture}"
-        return self._control.do(by, "job.submit", work, job, detail=what, steers=False)
+        made = self._control.do(by, "job.submit", work, job, detail=what, steers=False)
+        return made if key is None else self._same(made, request)
+
+    def _same(self, job: Job, request: JobRequest) -> Job:
+        """The job, where it is what the request asks for. Raises `KeyUsed`."""
+        pipeline, wanted = request.pipeline, self._models / (request.model or job.id)
+        timeout_s = pipeline.timeout_s
+        theirs = (pipeline.name, pipeline.options.to_dict(), pipeline.priority, pipeline.retries)
+        same = (
+            (job.pipeline, job.options, job.priority, job.retries) == theirs
+            and Path(job.capture).name == request.capture
+            and Path(job.model).name == wanted.name
+            and (None if timeout_s is None else round(1000 * timeout_s))
+            == (None if job.timeout_s is None else round(1000 * job.timeout_s))
+        )
+        if not same:
+            raise KeyUsed(job)
+        return job
 
     def _submit(self, job: str, request: JobRequest) -> Job:
         check_kept(request.capture)

@@ -23,6 +23,7 @@ from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
+from stage_service.devices.permission import Permission
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 
@@ -63,6 +64,13 @@ def slack() -> int:
     a test says what happens within a device's deadline, not how fast the machine is.
     """
     return machine_slack()
+
+
+@pytest.fixture
+def permitted() -> Iterator[None]:
+    """The test lights the devices itself, as a run does that was granted permission."""
+    with Permission.granted("a test").used():
+        yield
 
 
 @pytest.fixture

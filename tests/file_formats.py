@@ -53,6 +53,7 @@ from reconstruction.report.report import Report
 from simulators.peers.faults import Faults
 from stage_service.acquisition.states import read_status
 from stage_service.captures.capture_queue import CaptureQueue
+from stage_service.captures.hold import Hold
 from stage_service.captures.latch import Latch
 from stage_service.captures.status_index import StatusIndex
 from stage_service.config import load_rig_file
@@ -284,7 +285,7 @@ def _tokens(file: Path) -> None:
 
 
 def _queue(file: Path) -> None:
-    CaptureQueue(file, EventLog(), lambda _: "", lambda: None)
+    CaptureQueue(file, EventLog(), lambda _: "", lambda: None, Hold(EventLog()))
     file.unlink(missing_ok=True)
     for aside in file.parent.glob("*.broken-*"):
         aside.unlink()

@@ -30,6 +30,11 @@ class Client(httpx.Client):
 
     service: Service
 
+    def go_on(self) -> httpx.Response:
+        """Read why the queue is held, and say that it may go on."""
+        hold = self.get("/queue").json()["hold"]
+        return self.post("/queue:go-on", json={"hold": hold["id"] if hold else "none"})
+
 
 @contextmanager
 def serving(

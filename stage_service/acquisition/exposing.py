@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from reconstruction import Step
@@ -29,7 +28,8 @@ class Exposing:
     """Exposes a step on connected devices, at most `rate_hz` times a second.
 
     `watch` is called right before a step's light, and raises what forbids it. Raises `DeviceError`
-    where a device fails, `Cancelled` when `cancel` is set meanwhile.
+    where a device fails, `NotPermitted` where the thread's permission is over, `Cancelled` when
+    `cancel` is set meanwhile.
     """
 
     def __init__(
@@ -46,18 +46,6 @@ class Exposing:
         self._devices, self._lamp, self._cancel, self._timings = devices, lamp, cancel, timings
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
-        self._lighting = threading.Lock()
-
-    @contextmanager
-    def no_light(self, within_s: float) -> Iterator[None]:
-        """A context in which, once `cancel` is set, nothing more goes on; a device that takes
-        longer than `within_s` to light something is not waited for."""
-        held = self._lighting.acquire(timeout=within_s)
-        try:
-            yield
-        finally:
-            if held:
-                self._lighting.release()
 
     def expose(self, step: Step) -> Pulse:
         """Make one pulse in the step's light."""
@@ -67,8 +55,7 @@ class Exposing:
         self._next = time.monotonic() + self._period
         if self._watch is not None:
             self._watch(step)
-        with timings.on("lights"), self._lighting:
-            self._sleep(0)  # not even one more lamp once somebody asked for a blackout
+        with timings.on("lights"):
             self._light(step)
         with timings.on("settle"):
             self._sleep(self._devices.config.lights.settle_s)

@@ -24,6 +24,8 @@ from stage_service.devices.cameras.interface import CameraDevice, Frame
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
+from stage_service.devices.permission import NotPermitted, Permission
+from stage_service.devices.standstill import Standstill
 from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
 
@@ -50,7 +52,9 @@ class Sequencer:
     """One run over the frames that a capture still lacks, so an interrupted one goes on where it
     stopped. `run` blocks; the other methods may be called from any thread.
 
-    `plan` is the writer's. `watch` is called before the service lights a step, and raises what
+    `plan` is the writer's. All that the run lights, again after a missed frame, too, it lights by
+    `permission`, which abort, blackout, a standstill of the service and the end of the run revoke,
+    and which a pause suspends. `watch` is called before the service lights a step, and raises what
     forbids it; what the box clocks keeps to the plan's prediction. `notify(kind, data)` hears
     "capture.state", "capture.progress", "capture.step", "capture.frame_missing". Whatever ends the
     run, lamps and projectors are put off and read back. `progress` is asked by any thread.
@@ -62,6 +66,7 @@ class Sequencer:
         writer: CaptureWriter,
         plan: ResolvedPlan,
         *,
+        permission: Permission,
         watch: Callable[[Step], None] | None = None,
         notify: Notify = lambda _kind, _data: None,
     ) -> None:
@@ -82,7 +87,7 @@ class Sequencer:
         )
         self._began: float | None = None
         self._ended: float | None = None
-        self._writer = writer
+        self._writer, self._permission = writer, permission
         self._retries, self._runs, self._rate_hz = plan.retries, plan.runs, plan.plan.rate_hz
         self._notify = notify
         self._machine = Machine()
@@ -135,9 +140,12 @@ class Sequencer:
             self._move("pause")
 
     def resume(self) -> None:
-        """Go on, or take back a pause that has not begun. Raises `WrongState`."""
+        """Go on, or take back a pause that has not begun. Raises `WrongState`, and `NotPermitted`
+        where the permission was revoked meanwhile."""
         with self._changed:
             self._require("resume")
+            if self.state == "paused":
+                self._permission.grant()
             self._pause_asked = False
             if self.state == "pausing":
                 self._move("resume")
@@ -148,6 +156,7 @@ class Sequencer:
         with self._changed:
             self._require("abort")
             self._abort_asked = True
+            self._permission.revoke("the capture was aborted")
             if self.state != "aborting":
                 self._move("abort")
             self._changed.notify_all()
@@ -157,6 +166,7 @@ class Sequencer:
         with self._changed:
             self._abort_asked = True
             self._cancel.set()
+            self._permission.revoke("the stage was put dark")
             if self.state != "aborting" and self._machine.allows("abort"):
                 self._move("abort")
             self._changed.notify_all()
@@ -176,7 +186,7 @@ class Sequencer:
             return self.blackout
         deadline = time.monotonic() + within_s
         blackout(self.devices, attempts=1, within_s=0.0)  # what hears it goes dark now
-        with self._exposing.no_light(within_s / 2):
+        with self._permission.no_light(within_s / 2):
             return blackout(self.devices, within_s=deadline - time.monotonic())
 
     def run(self) -> Outcome:
@@ -191,10 +201,14 @@ class Sequencer:
             if self.state == "idle":  # nobody has asked to abort it yet
                 self._move("start")
         try:
-            self._session()
+            with self._permission.used():
+                self._session()
             self._move("complete")
-        except Cancelled:
-            self._move("stop")
+        except (Cancelled, NotPermitted) as error:
+            if isinstance(error, Cancelled) or self._abort_asked:
+                self._move("stop")
+            else:
+                self._fail(error)
         except BaseException as error:
             self._fail(error)
             leave = None if isinstance(error, Exception) else error
@@ -250,6 +264,7 @@ class Sequencer:
                 device.set_watchdog(devices.config.watchdog_s)
             every = devices.config.heartbeat_s
             beats = [stack.enter_context(Heartbeat(device, every)) for device in watched]
+            stack.enter_context(Standstill(devices.config.watchdog_s, self._permission.lapse))
             self._exposing.dark()
             for run in self._runs:
                 todo = {s: w for s in run.steps if (w := self._wanted(s))}
@@ -414,6 +429,7 @@ class Sequencer:
             raise RuntimeError(f"pausing: {dark.detail}")
         with self._changed:
             if self.state == "pausing":
+                self._permission.suspend("the capture is paused")
                 self._move("hold")
             while not self._changed.wait_for(
                 lambda: self._abort_asked or not self._pause_asked, self.devices.config.heartbeat_s
@@ -436,6 +452,7 @@ class Sequencer:
             self._say_state()
 
     def _black_out(self) -> None:
+        self._permission.revoke("the run is over")
         self.blackout = blackout(self.devices)
         self._dark.set()
 

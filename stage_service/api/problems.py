@@ -27,20 +27,23 @@ from stage_service.acquisition.states import WrongState
 from stage_service.captures.capture_queue import QueueFull, UnknownEntry
 from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Forbidden
+from stage_service.captures.hold import HoldChanged
 from stage_service.captures.latch import CannotAcknowledge, Unsafe
-from stage_service.captures.manager import Busy
+from stage_service.captures.may_light import Busy, NotNow
 from stage_service.devices.device_set import NoStage
 from stage_service.devices.ownership import StageInUse
+from stage_service.devices.permission import NotPermitted
 from stage_service.frames import UnknownFrame
 from stage_service.inputs import BadInput
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.attempts import TooManyLogins
+from stage_service.records.audit import NotRecorded
 from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
 from stage_service.storage import BadUpload, InUse, NotThere
-from stage_service.submitting import ModelInUse, NotFinished, UnknownArtifact
+from stage_service.submitting import KeyUsed, ModelInUse, NotFinished, UnknownArtifact
 from stage_service.viewer import BadLight, NothingToView
 from stage_service.watching import NotReady
 
@@ -81,6 +84,15 @@ bad-input 422 A file or name in the request cannot be used
     `detail` names it and says what was expected. Paths are those of the service's machine.
 busy 409 Another capture is running
     The stage makes one capture at a time. Wait for `running`, or abort it.
+not-now 409 Light may not be put on now
+    `detail` says why: the service ends, the stage is put dark or was since the request came,
+    nobody knows yet whether it is dark, or the request is too old. Ask again when that is over.
+hold-changed 409 The queue is held for another reason
+    `held` says why, and something has happened since you read it. Send `hold` once you have read
+    it: `POST /queue:go-on`.
+not-recorded 507 The disk did not take what has to last
+    Who steers, and who answers for flashes, is on the disk before it counts. `detail` names the
+    file and the disk's error; nothing has changed.
 stage-in-use 409 Another service has this stage
     `detail` says which. Stop it; where its machine is dead, start this one with `--take-over`.
 no-stage 409 The rig file names no devices
@@ -122,6 +134,8 @@ not-finished 409 The capture is not finished
     one that did not.
 model-in-use 409 Another job makes this model
     Wait until it is done, cancel it, or name another model.
+key-used 409 This Idempotency-Key stands for another request
+    `detail` names the job. A key is its caller's own, and of one request: send another key.
 unknown-capture 404 No such capture
     `GET /captures` lists the captures.
 unknown-frame 404 No such step or camera
@@ -172,6 +186,10 @@ BY_ERROR: dict[type[Exception], str] = {
     QueueFull: "queue-full",
     NotContained: "bad-input",
     Busy: "busy",
+    NotNow: "not-now",
+    NotPermitted: "not-now",
+    HoldChanged: "hold-changed",
+    NotRecorded: "not-recorded",
     JournalInUse: "journal-in-use",
     FlashRefusal: "flash-rate",
     Unsafe: "unsafe",
@@ -185,6 +203,7 @@ BY_ERROR: dict[type[Exception], str] = {
     TooManyLogins: "too-many-logins",
     WrongState: "wrong-state",
     NotFinished: "not-finished",
+    KeyUsed: "key-used",
     ModelInUse: "model-in-use",
     JobsUnavailable: "jobs-unavailable",
     UnknownCapture: "unknown-capture",
@@ -199,7 +218,7 @@ BY_ERROR: dict[type[Exception], str] = {
 
 WHO_MAY = {"unauthorized", "forbidden", "too-many-logins"}
 """Kinds that are about who asks: the gate has them audited."""
-EXTRA = ("problems", "running", "state", "holder", "expires", "scope")
+EXTRA = ("problems", "running", "state", "holder", "expires", "scope", "held", "hold")
 """Attributes of an error that its problem document repeats."""
 
 

@@ -9,7 +9,13 @@ from fastapi import APIRouter, Query, Response, status
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Steers
 from stage_service.captures.capture_queue import Entry
-from stage_service.service_models import MoveRequest, QueueRequest, QueueView, ResumeRequest
+from stage_service.service_models import (
+    GoOnRequest,
+    MoveRequest,
+    QueueRequest,
+    QueueView,
+    ResumeRequest,
+)
 
 router = APIRouter(tags=["queue"])
 reading = APIRouter(dependencies=READS, tags=["queue"])
@@ -59,11 +65,13 @@ def start_one(
 
 @router.post("/queue:hold")
 async def hold(service: OnService, lanes: OnLanes, by: Anybody) -> QueueView:
-    """Begin nothing by itself any more. So do a blackout, an abort, a capture that fails."""
+    """Begin nothing by itself any more. So do a start of the service, a blackout, an abort, a
+    capture that fails, a jump of the clock."""
     return await lanes.dark(service.queue.hold_by, by)
 
 
 @router.post("/queue:go-on")
-def go_on(service: OnService, by: Steers) -> QueueView:
-    """Begin what waits again, one after the other."""
-    return service.queue.go_on(by)
+def go_on(body: GoOnRequest, service: OnService, by: Steers) -> QueueView:
+    """Begin what waits again, one after the other: the caller has read why it is held. Where
+    something has happened since, it is 409, with the reason."""
+    return service.queue.go_on(body.hold, by)

@@ -162,8 +162,8 @@ async def submit_job(
     response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
-    """Enqueue a pipeline on a finished capture. Sent again with the same `Idempotency-Key`, it is
-    the same job."""
+    """Enqueue a pipeline on a finished capture. Sent again by the same caller with the same
+    `Idempotency-Key`, it is the same job; a key of another request is 409."""
     job = await lanes.jobs(service.jobs.submit, body, by, idempotency_key)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job

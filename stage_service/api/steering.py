@@ -36,8 +36,8 @@ async def caller(
     ] = None,
 ) -> Caller:
     """Who asks; raises `Forbidden` where their token lacks a scope that the route needs."""
-    identity = request.state.identity
-    by = Caller(address_of(request), lease, identity.name, identity.scopes)
+    identity, asked = request.state.identity, request.app.state.service.moment()
+    by = Caller(address_of(request), lease, identity.name, identity.scopes, asked)
     for scope in SCOPES:
         if scope in needed.scopes:
             by.require(scope)

@@ -1,7 +1,8 @@
 """Captures that wait for the stage: kept on disk, begun one after the other, never against anybody.
 
-Nothing begins by itself that would need somebody to arm it, nor after a blackout, somebody's word
-that it is dark, an abort or a capture that failed, until a person says that it may go on.
+Nothing begins by itself that would need somebody to arm it, nor after a start of the service, a
+blackout, somebody's word that it is dark, an abort, a capture that failed, a jump of the clock or a
+standstill, until a person who has read why says that it may (`Hold`).
 """
 
 from __future__ import annotations
@@ -15,18 +16,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, field_validator
 
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_json
 from reconstruction.reading import printable, read_json
 from stage_service.background import Background
-from stage_service.captures.manager import Busy
+from stage_service.captures.hold import STARTED, Hold, Reason
+from stage_service.captures.may_light import Busy, NotNow
+from stage_service.records.clock import ClockWatch, boot_seconds
 from stage_service.records.events import EventLog
 from stage_service.records.lease import Leased
 
 log = logging.getLogger("hairstage.queue")
 POLL_S = 0.5
+STOOD_STILL_S = 10.0
+"""A look that comes so many seconds late: the service was stopped, or starved. Whoever waited for a
+capture has long looked away."""
 MOST_BYTES = 8 << 20
 """What all that waits may take on the disk."""
 MOST_HISTORY = 1000
@@ -64,17 +70,25 @@ class _Kept(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    held: str | None = None
+    held: tuple[Reason, ...] = ()
     waiting: list[Entry] = []
     history: list[Entry] = []
+
+    @field_validator("held", mode="before")
+    @classmethod
+    def _of_another_version(cls, held: object) -> object:
+        if isinstance(held, str):
+            return [Reason(at=utc_now(), why=held)]
+        return () if held is None else held
 
 
 class CaptureQueue(Background):
     """What waits, in order, in the file `path`; a thread of its own begins it.
 
     `begin(entry)` starts a capture and returns its id; `waits_for()` says what keeps the stage from
-    beginning one by itself, or None. What `begin` refuses for another reason than that the stage is
-    not free holds the queue. `hold` waits for no disk. A file that is broken is set aside.
+    beginning one by itself, or None: while `hold` holds, that. What `begin` refuses for another
+    reason than that the stage is not free holds the queue. To hold waits for no disk. A file that
+    is broken is set aside.
     """
 
     def __init__(
@@ -83,39 +97,38 @@ class CaptureQueue(Background):
         events: EventLog,
         begin: Callable[[Entry], str],
         waits_for: Callable[[], str | None],
+        hold: Hold,
+        clock: ClockWatch | None = None,
     ) -> None:
         super().__init__("capture-queue")
-        self._path, self._events = path, events
+        self._path, self._events, self._hold = path, events, hold
+        self._clock = clock or ClockWatch()
         self._begin, self._stage_waits_for = begin, waits_for
         self._beginning = threading.Lock()  # one at a time, by the thread or by a person
         self._writing = threading.Lock()
         self._told: str | None = None
         self._unsaved = False
         self._kept = self._read()
+        hold.recall(self._kept.held)
+        hold.changed = self._hold_changed
 
     def start(
         self, begun: Mapping[str, str], unfinished: Collection[str], died: str | None = None
     ) -> None:
-        """Begin, with the captures that `begun` has by their entries' ids; hold where the last one
-        that was started from here is `unfinished`, or something waits and a service `died` in that
-        capture."""
+        """Begin, with the captures that `begun` has by their entries' ids. The hold names the
+        capture in which a service `died`, or the last one that was started from here where it is
+        `unfinished`."""
         with self._changed:
             for entry in list(self._kept.waiting):
                 if entry.id in begun:  # it died between the capture's first file and the queue's
                     self._to_history(entry, "started", begun[entry.id])
             started = (e.capture for e in reversed(self._kept.history) if e.capture is not None)
             last = next(started, None)
-            if died is None or not self._kept.waiting:
-                died = last if last in unfinished else None
-            if died is not None and self._kept.held is None:
-                self._kept.held = f"capture {died}, the last one, did not complete"
-                self._unsaved = True
+            if died is None and last in unfinished:
+                died = last
+        if died is not None:
+            self._hold.set(f"{STARTED}; capture {died}, the last one, did not complete")
         self._thread.start()
-
-    @property
-    def held(self) -> str | None:
-        """Why nothing begins by itself until a person says so."""
-        return self._kept.held
 
     def waits_for(self) -> str | None:
         """What the first one waits for; None: nothing, or nothing waits."""
@@ -124,8 +137,6 @@ class CaptureQueue(Background):
         if first is None:
             return None
         reason = self._stage_waits_for()
-        if reason is None and self.held is not None:
-            reason = f"held: {self.held}"
         if reason is None and first.needs_arming:
             reason = f"{first.id} flashes: somebody at the stage has to start and arm it"
         return reason
@@ -188,30 +199,25 @@ class CaptureQueue(Background):
                 entry = self._find(name)
             return self._begun(entry, begin(entry))
 
-    def hold(self, why: str, *, always: bool = False) -> None:
-        """Begin nothing by itself until `go_on`, where anything waits, or `always`."""
+    def _hold_changed(self) -> None:
         with self._changed:
-            if self._kept.held is not None or not (self._kept.waiting or always):
-                return
-            self._kept.held, self._unsaved = printable(why), True
+            self._unsaved = True
             self._changed.notify_all()
-        self._events.publish("queue.held", {"why": why})
-
-    def go_on(self) -> None:
-        """Begin what waits again."""
-        with self._changed:
-            was, self._kept.held = self._kept.held, None
-        self._save()
-        if was is not None:
-            self._events.publish("queue.goes_on", {"was": was})
 
     def _run(self) -> None:
         while True:
             with self._changed:
+                began = boot_seconds()
                 self._changed.wait_for(lambda: self._closed or self._unsaved, POLL_S)
+                late = boot_seconds() - began - POLL_S
                 if self._closed and not self._unsaved:
                     return
                 closed = self._closed
+            if late > STOOD_STILL_S:
+                self._hold.set(f"the service stood still for {late:.0f} s")
+            if (jump := self._clock.jump()) is not None:
+                why = "it was set, or the machine slept"
+                self._hold.set(f"the clock jumped by {jump:+.0f} s: {why}")
             try:
                 if self._unsaved:
                     self._save()
@@ -228,7 +234,6 @@ class CaptureQueue(Background):
 
     def _begin_the_next(self) -> None:
         with self._beginning:
-            # `held` is looked at last: who aborts, or blacks out, holds before the stage is free.
             reason = self.waits_for()
             if reason != self._told:
                 self._told = reason
@@ -241,12 +246,12 @@ class CaptureQueue(Background):
                 return
             try:
                 capture = self._begin(entry)
-            except (Busy, Leased):
+            except (Busy, NotNow, Leased):
                 return
             # The devices', the plan's, the disk's: it would be refused again, so that a person has
             # to look at it.
             except Exception as error:
-                self.hold(f"{entry.id} cannot begin: {error}")
+                self._hold.set(f"{entry.id} cannot begin: {error}")
                 return
             self._begun(entry, capture)
 
@@ -285,6 +290,8 @@ class CaptureQueue(Background):
     def _save(self) -> None:
         with self._writing:
             with self._changed:
+                held = self._hold.current
+                self._kept.held = () if held is None else held.reasons
                 data = self._kept.model_dump(mode="json")
                 self._unsaved = False
             try:
@@ -305,4 +312,5 @@ class CaptureQueue(Background):
             except OSError:
                 log.exception("%s cannot be set aside", self._path)
             log.error("%s was broken (%s) and was set aside as %s", self._path, error, aside)
-            return _Kept(held=f"{self._path.name} was broken and was set aside as {aside}")
+            why = f"{self._path.name} was broken and was set aside as {aside}"
+            return _Kept(held=(Reason(at=utc_now(), why=why),))

@@ -15,13 +15,15 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.acquisition.states import OUTCOMES, CaptureStatus, read_status
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError, ResolvedPlan, resolve
 from stage_service.records.events import EventLog
 
 
 class CaptureRun:
-    """One run over what a capture lacks; whoever makes it starts `sequencer` on `thread`.
+    """One run over what a capture lacks; whoever makes it grants its `permission` to light, and
+    starts `sequencer` on `thread`.
 
     Before a living subject the flash rate is watched, unless the plan has consent and somebody
     has armed it (`consented`).
@@ -37,7 +39,8 @@ class CaptureRun:
         *,
         consented: bool,
     ) -> None:
-        self.id = capture_id
+        self.id, self.plan = capture_id, plan
+        self.permission = Permission(f"capture {capture_id}")
         self.thread: threading.Thread | None = None
         self._events = events
         self._writer = writer
@@ -46,7 +49,12 @@ class CaptureRun:
         living = plan.rig_file.safety.living_subject
         free = not living or (plan.plan.consent is not None and consented)
         self.sequencer = Sequencer(
-            devices, writer, plan, watch=None if free else FlashWatch(), notify=self._notify
+            devices,
+            writer,
+            plan,
+            permission=self.permission,
+            watch=None if free else FlashWatch(),
+            notify=self._notify,
         )
 
     def status(self) -> CaptureStatus:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from stage_service.acquisition.safety import Blackout
 from stage_service.background import beside
+from stage_service.captures.may_light import Moment, Way, Word
 from stage_service.records.audit import AuditLog
 from stage_service.records.lease import Leases
 from stage_service.records.tokens import SCOPES, Scope
@@ -42,12 +43,13 @@ class Forbidden(PermissionError):
 @dataclass(frozen=True)
 class Caller:
     """Who asks: an address, the token of a lease where they have one, and their own token's name
-    ("" where nobody is asked for one) and scopes."""
+    ("" where nobody is asked for one) and scopes; and when, where that is known."""
 
     address: str
     token: str | None = None
     name: str = ""
     scopes: tuple[Scope, ...] = SCOPES
+    asked: Moment | None = None
 
     def require(self, scope: Scope) -> None:
         """Raise `Forbidden` without this scope."""
@@ -61,9 +63,8 @@ class Caller:
 class Control:
     """Lets callers take turns by leases, and records what each of them does."""
 
-    def __init__(self, audit: AuditLog) -> None:
-        self.leases = Leases()
-        self.audit = audit
+    def __init__(self, audit: AuditLog, leases: Leases) -> None:
+        self.audit, self.leases = audit, leases
         self._blackouts: list[Future[tuple[dict[str, Any], Future[None]]]] = []
         self._lock = threading.Lock()
 
@@ -122,13 +123,11 @@ class Control:
         wait([line], max(0.0, min(RECORDED_S, until - time.monotonic())))
         return answer
 
-    def record_arming(
-        self, by: Caller, capture: str, armed_by: str | None, consent: str | None = None
-    ) -> None:
-        """Record who answers for flashes, where anybody does."""
+    def word(self, by: Caller, way: Way, armed_by: str | None = None) -> Word:
+        """The caller's word for light. Raises `Forbidden` for arming without the scope "arm"."""
         if armed_by is not None:
-            detail = f"armed by {armed_by}; consent: {consent or 'as in the plan'}"
-            self._record(self._who(by), "flash.armed", capture, detail=detail)
+            by.require("arm")
+        return Word(way, by.token, armed_by, self._who(by), by.asked)
 
     def _record(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""

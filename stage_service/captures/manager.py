@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,16 +28,19 @@ from stage_service.acquisition.states import (
 )
 from stage_service.captures.capture_run import CaptureRun, Tally, plan_of
 from stage_service.captures.catalogue import Catalogue
-from stage_service.captures.latch import Unsafe
+from stage_service.captures.hold import STARTED, Hold
+from stage_service.captures.may_light import Facts, Moment, Word, check
 from stage_service.captures.snapshots import APART_S, SNAPSHOT
 from stage_service.captures.stage import Stage, unknown
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import ResolvedPlan, resolve
 from stage_service.records.audit import SERVICE, AuditLog
+from stage_service.records.clock import boot_seconds
 from stage_service.records.events import EventLog
-from stage_service.records.lease import RootLock
+from stage_service.records.lease import Leases, RootLock
 from stage_service.records.logs import about
 
 log = logging.getLogger("hairstage.captures")
@@ -52,14 +56,6 @@ TOLD_S = 1.0
 UNREAD = "a blackout is under way: not every lamp and projector has been read back dark yet"
 
 
-class Busy(RuntimeError):
-    """Another capture is running; the stage makes one at a time."""
-
-    def __init__(self, running: str) -> None:
-        super().__init__(f"capture {running} is running; wait for it, or abort it first")
-        self.running = running
-
-
 class CaptureManager:
     """Makes captures under `root/captures/<id>`, one at a time, each on a thread of its own.
 
@@ -71,7 +67,8 @@ class CaptureManager:
     stage; `take_over` says that one on another machine has it no more.
 
     A blackout that could not be verified is latched (`latch`): nothing is lit until that is over.
-    `audit` is where the captures' ends and the latch are recorded.
+    `audit` is where the captures' ends and the latch are recorded. Every way to a lamp goes through
+    `may_light`, with what is known here, the `leases` and the queue's `hold`.
     """
 
     def __init__(
@@ -87,25 +84,27 @@ class CaptureManager:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._root_lock = RootLock(root)
         self.audit, self.events = AuditLog(root / "audit.jsonl"), EventLog()
+        self.hold = Hold(self.events, _started(self._root_lock.left_by))
+        self._lock = threading.RLock()  # for moments, never while device or disk is waited for
+        self._running: CaptureRun | None = None
+        self._revocations = 0
         try:
+            self.leases = Leases(root / "lease.json")
             self.stage = Stage(
                 rig_file,
                 root,
                 self.audit,
                 self.events,
                 lambda: self._running is not None,
+                self._revoke,
                 take_over=take_over,
             )
         except BaseException:
             self._root_lock.release()
             raise
         self._on_complete = on_complete
-        self._lock = threading.RLock()  # for moments, never while device or disk is waited for
-        self._running: CaptureRun | None = None
         self._preparing: str | None = None
         self._closed = False
-        self.blackouts = 0  # begun since the start
-        self.ended: CaptureStatus | None = None  # the last run's, once the stage is free
         self._darkening = 0  # under way
         self._unread = 0  # of these, those whose devices have not all answered
         self._shooting = root / "shooting"  # names the capture under way
@@ -124,20 +123,20 @@ class CaptureManager:
         masks: dict[str, Bools] | None = None,
         head: Mesh | None = None,
         extra: dict[str, Any] | None = None,
-        armed_by: str | None = None,
-        unless_dark_since: int | None = None,
+        word: Word | None = None,
     ) -> str:
         """Validate, create the folder, begin on a thread; returns the capture's id at once.
 
-        `extra` is kept in `plan.json` and shown as `CaptureStatus.request`; `armed_by` says who at
-        the stage answers for flashes that the plan has consent for; with `unless_dark_since` it
-        begins only if no blackout has begun since `blackouts` was that number. Raises `Busy`,
-        `Unsafe`, `FlashRefusal`; `PlanError`, `CaptureError` (masks) before any device is touched.
-        Trouble with devices appears as outcome "failed" with `error`.
+        `extra` is kept in `plan.json` and shown as `CaptureStatus.request`; it begins on `word`,
+        without one on that of whoever calls. Raises what `may_light.check` does, `NotRecorded`
+        where it cannot be kept who has armed it; `PlanError`, `CaptureError` (masks) before any
+        device is touched. Trouble with devices appears as outcome "failed" with `error`.
         """
+        word = self._stamped(word or Word())
         resolved = resolve(plan, self.rig_file)
         cost = resolved.cost
-        resolved.check_flashing(armed_by)
+        _ = self.stage.devices  # raises where there are none
+        self._check(word, resolved)
         resolved.check_room(self.folder)
         now = datetime.now(UTC)
         capture_id = f"{now:%Y%m%d-%H%M%S}-{now.microsecond // 16:04x}"  # sorted by time
@@ -146,21 +145,22 @@ class CaptureManager:
             "plan": plan.model_dump(mode="json"),
             "cost": cost.model_dump(mode="json"),
             "started": utc_now(),
-            "armed_by": armed_by,
+            "armed_by": word.armed_by,
             "request": extra or {},
         }
 
         def make(devices: DeviceSet) -> CaptureRun:
             folder, rig = self.folder / capture_id, self.rig_file.rig
             writer = CaptureWriter.create(folder, rig, description, masks=masks, head=head)
-            return self._run_of(capture_id, resolved, devices, writer, armed_by)
+            return self._run_of(capture_id, resolved, devices, writer, word)
 
-        self._launch(capture_id, make, unless_dark_since)
+        self._launch(capture_id, make, word)
         return capture_id
 
-    def snapshot(self, plan: ResolvedPlan) -> CaptureStatus:
+    def snapshot(self, plan: ResolvedPlan, word: Word | None = None) -> CaptureStatus:
         """Shoot the plan as the capture `SNAPSHOT`, in place of the last one; it is in no list, and
-        nothing follows it. Raises `Busy`, `Unsafe`."""
+        nothing follows it. Raises what `may_light.check` does."""
+        word = self._stamped(word or Word("snapshot"))
         folder = self.folder.parent / SNAPSHOT
         cost = plan.cost.model_dump(mode="json")
         told = {"steps": list(plan.steps), "cost": cost, "started": utc_now()}
@@ -171,12 +171,12 @@ class CaptureManager:
             self.catalogue.take(SNAPSHOT)
             shutil.rmtree(folder, ignore_errors=True)
             writer = CaptureWriter.create(folder, self.rig_file.rig, told)
-            return self._run_of(SNAPSHOT, plan, devices, writer, None)
+            return self._run_of(SNAPSHOT, plan, devices, writer, word)
 
-        self._launch(SNAPSHOT, make)
+        self._launch(SNAPSHOT, make, word)
         return self.get(SNAPSHOT)
 
-    def _continue(self, capture_id: str, armed_by: str | None) -> None:
+    def _continue(self, capture_id: str, word: Word) -> None:
         """Shoot what a capture lacks that is done and did not complete."""
         done = self.get(capture_id)
         if "continue" not in possible(done.state, done.outcome):
@@ -185,11 +185,11 @@ class CaptureManager:
         def make(devices: DeviceSet) -> CaptureRun:
             path = Path(done.path)
             plan = plan_of(Capture(path), self.rig_file)
-            plan.check_flashing(armed_by)
+            self._check(word, plan, capture_id)
             writer = CaptureWriter.reopen(path)
-            return self._run_of(capture_id, plan, devices, writer, armed_by)
+            return self._run_of(capture_id, plan, devices, writer, word)
 
-        self._launch(capture_id, make)
+        self._launch(capture_id, make, word)
 
     def _run_of(
         self,
@@ -197,30 +197,31 @@ class CaptureManager:
         plan: ResolvedPlan,
         devices: DeviceSet,
         writer: CaptureWriter,
-        armed_by: str | None,
+        word: Word,
     ) -> CaptureRun:
-        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=bool(armed_by))
+        armed = word.armed_by is not None
+        run = CaptureRun(capture_id, plan, devices, writer, self.events, consented=armed)
         name = f"capture-{capture_id}"
         run.thread = threading.Thread(target=self._run, args=(run,), name=name, daemon=True)
         return run
 
-    def _launch(
-        self, capture_id: str, make: Callable[[DeviceSet], CaptureRun], since: int | None = None
-    ) -> None:
-        """Begin what `make` prepares in the disk's own time, unless a blackout comes meanwhile."""
+    def _launch(self, capture_id: str, make: Callable[[DeviceSet], CaptureRun], word: Word) -> None:
+        """Begin what `make` prepares in the disk's own time, unless the word counts no more then:
+        its permission is granted at the last moment."""
+        devices = self.stage.devices  # no folder is made where there are none
         with self._lock:
-            self._check_free()
-            blackouts = self.blackouts if since is None else since
+            self._check(word)
             self._preparing = capture_id
         run = None
         try:
             self.stage.take()  # the bank may have been switched off, and its owner forgotten
-            run = make(self.stage.devices)  # no folder is made where there are none
+            run = make(devices)
             write_whole(self._shooting, f"{capture_id}\n".encode())
+            self._record_arming(word, capture_id, run.plan)
             with self._lock:
-                if self._closed or self.blackouts != blackouts:
-                    raise Busy("none, but the stage was put dark meanwhile")
+                self._check(word, run.plan, capture_id)
                 assert run.thread is not None
+                run.permission.grant()
                 self._running = run  # first: its thread may end at once
                 try:
                     run.thread.start()
@@ -247,15 +248,52 @@ class CaptureManager:
         if died is not None and _text(self._shooting) == died:  # not that of another by now
             self._shooting.unlink(missing_ok=True)
 
-    def _check_free(self) -> None:
-        if self._closed:
-            raise Busy("none, but the service is closing")
-        if self._darkening:
-            raise Busy("none, but the stage is being put dark")
-        going = self._preparing if self._running is None else self._running.id
-        if going is not None:
-            raise Busy(going)
-        self.stage.latch.check()
+    def moment(self) -> Moment:
+        """Now, as what is asked for from here on has it."""
+        return Moment(self._revocations, boot_seconds())
+
+    def _stamped(self, word: Word) -> Word:
+        return word if word.given is not None else replace(word, given=self.moment())
+
+    def _check(self, word: Word, plan: ResolvedPlan | None = None, own: str | None = None) -> None:
+        """Raise what the table refuses the word for; `own` is the capture that it is for."""
+        flashes, given = None, word.given or self.moment()
+        if plan is not None:
+            try:
+                plan.check_flashing(word.armed_by)
+            except FlashRefusal as error:
+                flashes = error
+        unread = self.catalogue.unread if word.way == "queue" else 0  # may look at the disk
+        with self._lock:
+            going = self._preparing if self._running is None else self._running.id
+            facts = Facts(
+                closing=self._closed,
+                darkening=self._darkening > 0,
+                revoked=given.revocations != self._revocations,
+                stale=boot_seconds() - given.at,
+                running=None if going == own else going,
+                latched=self.stage.latch.latched,
+                unknown=not self.stage.known_dark,
+                unread=unread,
+                leased=self.leases.of_others(word.lease),
+                held=self.hold.current,
+                flashes=flashes,
+            )
+        check(word.way, facts)
+
+    def _revoke(self, why: str) -> None:
+        """Let nothing be lit any more on a word that was given before."""
+        with self._lock:
+            self._revocations += 1
+            if self._running is not None:
+                self._running.permission.revoke(why)
+
+    def _record_arming(self, word: Word, capture_id: str, plan: ResolvedPlan | None) -> None:
+        """Have it on the disk who answers for flashes. Raises `NotRecorded`."""
+        if word.armed_by is not None:
+            consent = None if plan is None else plan.plan.consent
+            told = f"armed by {word.armed_by}; consent: {consent or 'as in the plan'}"
+            self.audit.require(word.who, "flash.armed", capture_id, told)
 
     @property
     def running(self) -> str | None:
@@ -327,16 +365,22 @@ class CaptureManager:
         """Pause at the next step boundary. Raises `UnknownCapture`, `WrongState`."""
         return self._steer(capture_id, "pause")
 
-    def resume(self, capture_id: str, *, armed_by: str | None = None) -> CaptureStatus:
+    def resume(self, capture_id: str, word: Word | None = None) -> CaptureStatus:
         """Go on after a pause; of a capture that did not complete, shoot what is missing.
 
-        Raises `UnknownCapture` and `WrongState`; what continues a capture raises as `start` does,
-        and `PlanError` where the rig file is no longer that of the capture.
+        Raises `UnknownCapture` and `WrongState`; otherwise as `start` does, and `PlanError` where
+        the rig file is no longer that of the capture. The word's way is found here.
         """
+        word = self._stamped(word or Word())
         if self.get(capture_id).state == "done":
-            self._continue(capture_id, armed_by)
+            self._continue(capture_id, replace(word, way="continue"))
             return self.get(capture_id)
-        return self._steer(capture_id, "resume")
+        word = replace(word, way="resume")
+        self._check(word, own=capture_id)
+        self._record_arming(word, capture_id, None)
+        with self._lock:
+            self._check(word, own=capture_id)
+            return self._steer(capture_id, "resume")
 
     def abort(self, capture_id: str) -> CaptureStatus:
         """Abort at the next step boundary. Raises `UnknownCapture`, `WrongState`."""
@@ -364,13 +408,10 @@ class CaptureManager:
 
     def waits_for(self) -> str | None:
         """What keeps a capture from beginning that nobody stands by; None: nothing does."""
-        with self._lock:
-            try:
-                self._check_free()
-            except (Busy, Unsafe) as error:
-                return str(error)
-            if not self.stage.known_dark:
-                return "whether the stage is dark is not known yet"
+        try:
+            self._check(Word("queue"))
+        except RuntimeError as error:
+            return str(error)
         return None
 
     def not_dark(self) -> str | None:
@@ -402,10 +443,10 @@ class CaptureManager:
         """
         devices = self.stage.devices
         with self._lock:
-            self.blackouts += 1
             self._darkening += 1  # nothing may begin until it is over
             self._unread += 1
             run = self._running
+            self._revoke("the stage was put dark")
         late = threading.Timer(TOLD_S, lambda: self.events.publish("stage.lamps", self.safety()))
         late.daemon = True
         try:
@@ -441,6 +482,7 @@ class CaptureManager:
         with self._lock:
             self._closed = True
             run = self._running
+            self._revoke("the service is closing")
         if run is not None and run.thread is not None:
             result = run.sequencer.darken(STOP_WITHIN_S)
             run.thread.join(STOP_WITHIN_S)
@@ -500,11 +542,23 @@ class CaptureManager:
                 self._shooting.unlink(missing_ok=True)
         with self._lock:
             self._tally.add(run, result if kept else None)
-            if kept or result != "completed":
-                self.ended = status
+            # Before the stage is free; whoever aborted has held the queue already.
+            if result != "completed" and not (result == "aborted" and self.hold.current):
+                self.hold.set(f"capture {run.id} {result}{_because(status.error)}")
             self.catalogue.put(status)
             self._running = None
         self.events.publish("capture.over", {"id": run.id, "outcome": result})
+
+
+def _started(left_by: str | None) -> str:
+    """Why the queue is held from the start on."""
+    if left_by is None:
+        return STARTED
+    return f"{STARTED}; the one before it (process {left_by}) was killed or died"
+
+
+def _because(error: str | None) -> str:
+    return f": {error.rstrip('.')}" if error else ""
 
 
 def _text(path: Path) -> str | None:

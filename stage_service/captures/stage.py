@@ -50,7 +50,8 @@ def put_off(rig_file: RigFile, root: Path, *, take_over: bool = False) -> str:
 class Stage:
     """All who connect to the devices outside a capture go through here, one after the other.
 
-    `lit()` says whether a capture has the devices now. Constructing connects to nothing; raises
+    `lit()` says whether a capture has the devices now; `revoke(why)` takes the right to light from
+    every capture, which the latch does when it is set. Constructing connects to nothing; raises
     `RigError` for devices that cannot be, and `StageInUse` while another process on this machine
     has the stage, `take_over` says that one on another machine has it no more. A blackout that
     could not be verified is latched (`latch`), which is recorded in `audit`.
@@ -63,9 +64,11 @@ class Stage:
         audit: AuditLog,
         events: EventLog,
         lit: Callable[[], bool],
+        revoke: Callable[[str], object],
         *,
         take_over: bool = False,
     ) -> None:
+        self._revoke = revoke
         self._rig_file, self._audit, self._events, self._lit = rig_file, audit, events, lit
         self._ownership = None
         if rig_file.devices is not None:
@@ -143,6 +146,8 @@ class Stage:
 
     def _tell(self, change: str | None, result: Blackout) -> None:
         """Record and publish what `result` did to the latch, and what is known of the lamps."""
+        if change == "set":
+            self._revoke(f"the stage was latched: {result.detail}")
         if change is not None:
             self._audit.record(SERVICE, f"latch.{change}", "stage", detail=result.detail)
             self._events.publish("stage.latch", {"latched": change == "set", **result.to_dict()})

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from stage_service.config import Exposure, Level, Names, Strict, Text
+from stage_service.plan.person_text import LINES
 
 MOST_ROWS = 100_000
 Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
@@ -62,7 +63,7 @@ class CapturePlan(Strict):
     brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)
     stepping: Literal["auto", "software", "hardware"] = "auto"
     rate_hz: Annotated[float, Field(ge=0.01, le=1000.0)] | None = None
-    consent: Annotated[str, Text, Field(min_length=12, max_length=2000)] | None = None
+    consent: Annotated[str, Text, Field(min_length=12, max_length=2000), LINES] | None = None
     tracking_every: Annotated[int, Field(ge=0, le=MOST_ROWS)] | None = None
     retries: Annotated[int, Field(ge=0, le=20)] | None = None
     exposure: KindExposures = KindExposures()

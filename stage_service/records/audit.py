@@ -13,6 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from reconstruction.capture.writer import utc_now
+from reconstruction.files.durable import flush
 from reconstruction.reading import printable
 
 log = logging.getLogger("hairstage.audit")
@@ -20,6 +21,16 @@ SERVICE = "service"
 """Who acts when nobody asked for it."""
 MOST_WAITING = 1000
 """Lines that wait for a disk that does not answer, 0.5 MB; more go to the service's log alone."""
+
+
+class NotRecorded(OSError):
+    """What has to be on the disk first could not be written; what it was for is refused."""
+
+    def __init__(self, what: str, path: Path, error: OSError) -> None:
+        super().__init__(
+            f"{what} could not be written to {path}: {error.strerror or error}. It does not count: "
+            "make room on the disk, or see why it cannot be written to, then try again"
+        )
 
 
 class Action(BaseModel):
@@ -78,10 +89,7 @@ class AuditLog:
         self, who: str, action: str, subject: str, result: str, detail: str
     ) -> tuple[Future[None], bool]:
         """When the line is written; whether the caller is the one to write what waits."""
-        who, subject, detail = (printable(text) for text in (who, subject, detail))
-        line = Action(
-            time=utc_now(), who=who, action=action, subject=subject, result=result, detail=detail
-        ).model_dump_json()
+        line = _line(who, action, subject, result, detail)
         done: Future[None] = Future()
         with self._queue:
             if len(self._waiting) >= MOST_WAITING:
@@ -119,6 +127,14 @@ class AuditLog:
             file.flush()
             os.fsync(file.fileno())
 
+    def require(self, who: str, action: str, subject: str, detail: str) -> None:
+        """Append what has to be on the record before it is done. Raises `NotRecorded`."""
+        try:
+            self._append(_line(who, action, subject, "ok", detail))
+            flush(self._path.parent)  # the file may be new
+        except OSError as error:
+            raise NotRecorded(f"the record of {action}", self._path, error) from error
+
     def latest(self, limit: int) -> list[Action]:
         """The newest actions, oldest of them first; a torn line is left out."""
         newest = []
@@ -130,3 +146,10 @@ class AuditLog:
         except FileNotFoundError:
             return []
         return newest
+
+
+def _line(who: str, action: str, subject: str, result: str, detail: str) -> str:
+    who, subject, detail = (printable(text) for text in (who, subject, detail))
+    return Action(
+        time=utc_now(), who=who, action=action, subject=subject, result=result, detail=detail
+    ).model_dump_json()

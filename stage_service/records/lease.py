@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import logging
 import os
 import secrets
 import threading
@@ -10,9 +12,22 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from reconstruction.files.durable import flush, write_json
+from reconstruction.reading import read_json
+from stage_service.records.audit import NotRecorded
+from stage_service.records.clock import boot_seconds
+
+log = logging.getLogger("hairstage.lease")
+LONGEST_LEASE_S = 86400.0
+"""A day: whoever forgets a lease keeps others from the stage for no longer."""
+NO_TOKEN = "-"
+"""Instead of a digest: no token is that of this lease."""
 
 
 class Leased(RuntimeError):
@@ -32,21 +47,54 @@ class NoLease(LookupError):
 
 @dataclass(frozen=True)
 class Lease:
-    """Held by `holder` until `expires` (UTC); whoever knows `token` steers in their name."""
+    """Held by `holder` until `expires` (UTC); whoever sends the token of this SHA-256 steers in
+    their name."""
 
-    token: str
     holder: str
     expires: str
+    digest: str
+
+
+@dataclass(frozen=True)
+class GrantedLease(Lease):
+    """A lease with its token, which is kept nowhere."""
+
+    token: str
+
+
+class _Kept(BaseModel):
+    """The file: `seconds` is what was granted, `ends` the wall clock at the end, Unix seconds."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    holder: str
+    digest: str = Field(pattern=r"^([0-9a-f]{64}|-)$")
+    seconds: float = Field(ge=0.0, le=LONGEST_LEASE_S)
+    ends: float = Field(ge=0.0, le=1e11)
 
 
 class Leases:
-    """At most one lease; while there is one, only its token steers. A restart forgets it."""
+    """At most one lease, kept in the file `path`; while there is one, only its token steers.
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._lock = threading.Lock()
+    It is on the disk before `take` and `renew` return, which raise `NotRecorded` where it cannot
+    be, and so it is there after a restart: until `expires` by the wall clock, and never for longer
+    than it was granted for. A file that cannot be read may be anybody's lease: nobody steers for
+    the longest time that a lease has, unless an admin ends it. `clock` and `wall` give seconds; no
+    other method than those that change the lease waits for the disk.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        clock: Callable[[], float] = boot_seconds,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._path, self._clock, self._wall = path, clock, wall
+        self._writing = threading.Lock()
+        self._lock = threading.Lock()  # for moments
         self._lease: Lease | None = None
         self._ends = 0.0
+        self._read()
 
     @property
     def current(self) -> Lease | None:
@@ -54,46 +102,49 @@ class Leases:
         with self._lock:
             return self._now()
 
-    def take(self, holder: str, seconds: float) -> Lease:
-        """Begin a lease. Raises `Leased`."""
-        with self._lock:
-            held = self._now()
-            if held is not None:
+    def take(self, holder: str, seconds: float) -> GrantedLease:
+        """Begin a lease. Raises `Leased`, `NotRecorded`."""
+        with self._writing:
+            if (held := self.current) is not None:
                 raise Leased(held)
-            return self._keep(secrets.token_hex(8), holder, seconds)
+            token = secrets.token_hex(16)
+            lease = self._keep(holder, seconds, _digest(token))
+            return GrantedLease(lease.holder, lease.expires, lease.digest, token)
 
     def renew(self, token: str, seconds: float) -> Lease:
-        """Let the lease end so many seconds from now. Raises `NoLease`."""
-        with self._lock:
+        """Let the lease end so many seconds from now. Raises `NoLease`, `NotRecorded`."""
+        with self._writing:
             lease = self._own(token)
-            return self._keep(lease.token, lease.holder, seconds)
+            return self._keep(lease.holder, seconds, lease.digest)
 
-    def release(self, token: str) -> Lease:
+    def release(self, token: str) -> None:
         """End the lease. Raises `NoLease`."""
-        with self._lock:
-            lease = self._own(token)
-            self._lease = None
-            return lease
+        with self._writing:
+            self._own(token)
+            self._forget()
 
     def end(self) -> Lease:
         """End the lease whoever holds it. Raises `NoLease` where nobody does."""
-        with self._lock:
-            lease, self._lease = self._now(), None
-            if lease is None:
+        with self._writing:
+            if (lease := self.current) is None:
                 raise NoLease("nobody holds a lease")
+            self._forget()
             return lease
+
+    def of_others(self, token: str | None) -> Lease | None:
+        """The lease that keeps whoever sends this token from steering; None where none does."""
+        held = self.current
+        return None if held is None or _same(token, held) else held
 
     def check(self, token: str | None) -> None:
         """Raise `Leased` unless nobody holds a lease, or this token is its own."""
-        with self._lock:
-            held = self._now()
-            if held is not None and not _same(token, held.token):
-                raise Leased(held)
+        if (held := self.of_others(token)) is not None:
+            raise Leased(held)
 
     def holder(self, token: str | None) -> str | None:
         """Who holds the lease of this token."""
         held = self.current
-        return held.holder if held is not None and _same(token, held.token) else None
+        return held.holder if held is not None and _same(token, held) else None
 
     def _now(self) -> Lease | None:
         if self._lease is not None and self._clock() >= self._ends:
@@ -101,20 +152,67 @@ class Leases:
         return self._lease
 
     def _own(self, token: str) -> Lease:
-        held = self._now()
-        if held is None or not _same(token, held.token):
+        held = self.current
+        if held is None or not _same(token, held):
             raise NoLease("this lease has expired or was released: take a new one")
         return held
 
-    def _keep(self, token: str, holder: str, seconds: float) -> Lease:
-        expires = datetime.now(UTC) + timedelta(seconds=seconds)
-        self._ends = self._clock() + seconds
-        self._lease = Lease(token, holder, expires.isoformat(timespec="seconds"))
-        return self._lease
+    def _keep(self, holder: str, seconds: float, digest: str) -> Lease:
+        """Write the lease, then let it count. Raises `NotRecorded`; then the one before counts."""
+        ends, wall = self._clock() + seconds, self._wall() + seconds  # not longer by a slow disk
+        kept = _Kept(holder=holder, digest=digest, seconds=seconds, ends=wall)
+        self._write(kept)
+        with self._lock:
+            self._lease, self._ends = Lease(holder, _utc(wall), digest), ends
+            return self._lease
+
+    def _write(self, kept: _Kept) -> None:
+        try:
+            write_json(self._path, kept.model_dump())
+            flush(self._path.parent)
+        except OSError as error:
+            raise NotRecorded("the lease", self._path, error) from error
+
+    def _forget(self) -> None:
+        with self._lock:
+            self._lease = None
+        try:
+            self._path.unlink(missing_ok=True)
+            flush(self._path.parent)
+        except OSError:  # nobody is kept from steering for it but after a restart
+            log.exception("%s stays: its lease counts again after a restart", self._path)
+
+    def _read(self) -> None:
+        """Take up the lease of the service before."""
+        try:
+            kept = _Kept.model_validate(read_json(self._path))
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError):
+            log.exception("%s: nobody can tell who steers", self._path)
+            holder = f"somebody unknown ({self._path.name} is damaged; an admin can end the lease)"
+            ends = self._wall() + LONGEST_LEASE_S
+            kept = _Kept(holder=holder, digest=NO_TOKEN, seconds=LONGEST_LEASE_S, ends=ends)
+            try:
+                self._write(kept)  # or it would begin anew with each start
+            except NotRecorded:
+                log.exception("%s stays as it is", self._path)
+        left = min(kept.ends - self._wall(), kept.seconds)
+        if left > 0:
+            self._lease = Lease(kept.holder, _utc(self._wall() + left), kept.digest)
+            self._ends = self._clock() + left
 
 
-def _same(token: str | None, own: str) -> bool:
-    return token is not None and secrets.compare_digest(token.encode(), own.encode())
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "backslashreplace")).hexdigest()
+
+
+def _same(token: str | None, lease: Lease) -> bool:
+    return token is not None and secrets.compare_digest(_digest(token), lease.digest)
+
+
+def _utc(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
 
 
 class LockedBy(OSError):
@@ -124,11 +222,13 @@ class LockedBy(OSError):
 class FileLock:
     """Held until `release`; the kernel frees it when the process dies. `text` says who holds it.
 
-    A lock that is `shared` may be taken by every user of the machine. Raises `LockedBy`.
+    A lock that is `shared` may be taken by every user of the machine. `left_by` is the text of a
+    process that ended without `release`. Raises `LockedBy`.
     """
 
     def __init__(self, path: Path, text: str, shared: bool = False) -> None:
         self._path = path
+        self.left_by: str | None = None
         while True:
             self._file = _opened(path, shared)
             try:
@@ -139,6 +239,7 @@ class FileLock:
             if self._is_there():
                 break
             self._file.close()  # it was released, and removed, in between
+        self.left_by = self._file.read(1000).strip() or None
         # A full disk must not keep a service from starting, which darkens: it only goes unnamed.
         with suppress(OSError):
             os.ftruncate(self._file.fileno(), 0)
@@ -170,7 +271,7 @@ def _opened(path: Path, shared: bool) -> IO[str]:
                 os.fchmod(handle, 0o666)
     except PermissionError as error:
         raise LockedBy(f"another user, to whom {path} belongs") from error
-    return os.fdopen(handle, "r+")
+    return os.fdopen(handle, "r+", errors="replace")
 
 
 class RootInUse(OSError):

@@ -25,6 +25,12 @@ from stage_service.devices.trigger.serial_box import SerialTriggerBox
 FIRMWARE = Path(__file__).resolve().parents[2] / "deploy" / "firmware"
 TIMEOUT_S = 30.0  # where no deadline is meant to be missed
 
+
+@pytest.fixture(autouse=True)
+def _lights_itself(permitted: None) -> None:
+    """Tests of drivers command them without a run."""
+
+
 Edge = tuple[float, str, bool]
 """When, which output (L, P, C), and whether it went up; a camera pulse is the way up alone."""
 

@@ -12,6 +12,7 @@ from reconstruction import CaptureWriter, verify
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.captures.manager import CaptureManager
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -28,7 +29,7 @@ def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monke
     )
     plan = resolve(CapturePlan(stepping=stepping), rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
-    run = Sequencer(DeviceSet.of(rig_file), writer, plan)
+    run = Sequencer(DeviceSet.of(rig_file), writer, plan, permission=Permission.granted("a test"))
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
     assert world.pulses == len(plan.steps) > 2 * 21
@@ -51,7 +52,9 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
 
     if stepping == "hardware":
         writer.reserve = 2 * shutil.disk_usage(tmp_path).total
-    run = Sequencer(DeviceSet.of(rig_file), writer, plan, notify=notify)
+    run = Sequencer(
+        DeviceSet.of(rig_file), writer, plan, notify=notify, permission=Permission.granted("a test")
+    )
     assert run.run() == "failed"
     assert "bytes are needed and a reserve" in str(run.error)
     assert not world.lamps.power().any()
@@ -62,7 +65,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     told("disk: no room left", stepping, "failed", 0, run.error)
 
     again = CaptureWriter.reopen(tmp_path / "c")
-    run = Sequencer(DeviceSet.of(rig_file), again, plan)
+    run = Sequencer(DeviceSet.of(rig_file), again, plan, permission=Permission.granted("a test"))
     assert run.run() == "completed", run.error
     assert verify(tmp_path / "c") == []
 
@@ -79,6 +82,7 @@ def test_the_duty_is_counted_over_captures_that_the_box_clocks(simulated, small_
         stepping="hardware",
     )
     manager = CaptureManager(rig_file, tmp_path / "root")
+    manager.stage.darken()
     captures = [manager.wait(manager.start(plan), 30) for _ in range(3)]
     manager.close()
     assert [c.outcome for c in captures] == ["completed", "completed", "failed"]
@@ -94,6 +98,7 @@ def test_the_duty_of_a_lamp_is_counted_over_several_captures(simulated, small_ri
         lights=("light_003",), projectors=(), sentinels=False, exposure={"olat": 0.09}
     )
     manager = CaptureManager(rig_file, tmp_path / "root")
+    manager.stage.darken()
     captures = []
     for _ in range(4):
         captures.append(manager.wait(manager.start(plan), 30))

@@ -18,6 +18,7 @@ from simulators.peers.devices import DEVICES_FILE
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import load_rig_file
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -58,7 +59,12 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, t
     seconds = time.monotonic() - killed
     kept = frames(tmp_path / "c")
     writer = CaptureWriter.reopen(tmp_path / "c")
-    again = Sequencer(DeviceSet.of(rig_file), writer, resolve(plan, rig_file))
+    again = Sequencer(
+        DeviceSet.of(rig_file),
+        writer,
+        resolve(plan, rig_file),
+        permission=Permission.granted("a test"),
+    )
     assert again.run() == "completed", again.error
     assert verify(tmp_path / "c") == []
     assert kept.items() <= frames(tmp_path / "c").items(), "a finished frame was shot again"
@@ -93,7 +99,13 @@ def test_sigkill_of_the_devices(simulated, tmp_path, told):
                 peers.kill()
                 peers.wait()
 
-        run = Sequencer(DeviceSet.of(there), writer, plan, notify=notify)
+        run = Sequencer(
+            DeviceSet.of(there),
+            writer,
+            plan,
+            notify=notify,
+            permission=Permission.granted("a test"),
+        )
         assert run.run() == "failed"
     finally:
         peers.kill()

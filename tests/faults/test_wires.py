@@ -13,6 +13,7 @@ from reconstruction import Capture, CaptureWriter, verify
 from simulators.peers.faults import Fault
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -259,7 +260,7 @@ def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, t
     rig_file, world = simulated(*one.faults, rig=rig)
     plan = resolve(CapturePlan(lights=LIGHTS, stepping=stepping), rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
-    run = Sequencer(DeviceSet.of(rig_file), writer, plan)
+    run = Sequencer(DeviceSet.of(rig_file), writer, plan, permission=Permission.granted("a test"))
     run.run()
     assert run.outcome == one.outcome, run.error
     if one.dark:

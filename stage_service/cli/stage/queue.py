@@ -76,18 +76,28 @@ def run_start_one(args: argparse.Namespace, output: Output, service: ServiceClie
 def run_hold(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
     """Begin nothing by itself any more.
 
-    A blackout, an abort and a capture that does not complete do the same.
+    A start of the service, a blackout, an abort, a capture that does not complete and a jump of the
+    clock do the same.
     """
     _show(service.post("/queue:hold"), output)
 
 
 def run_go_on(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Begin what waits again."""
-    _show(service.post("/queue:go-on"), output)
+    """Begin what waits again; prints why the queue was held.
+
+    Where something happens meanwhile the queue stays held: read why, and say it again.
+    """
+    queue = service.get("/queue")
+    if queue["hold"] is not None:
+        output.note(f"The queue was held: {queue['held']}.")
+        queue = service.post("/queue:go-on", {"hold": queue["hold"]["id"]})
+    _show(queue, output)
 
 
 def _show(queue: dict[str, Any], output: Output) -> None:
     lines = [f"{e['id']}  by {e['by']}  {e['added']}" for e in queue["waiting"]]
-    if queue["waits_for"] or queue["held"]:
-        lines.append(f"waits for: {queue['waits_for'] or queue['held']}")
+    if queue["held"]:
+        lines.append(f"held: {queue['held']}")
+    if queue["waits_for"] and not queue["waits_for"].startswith("held: "):
+        lines.append(f"waits for: {queue['waits_for']}")
     output.result(queue, "\n".join(lines) or "nothing waits")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from stage_service.config import SafetyLimits
 from stage_service.devices.errors import DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import LightBank, LightStatus, Lit
+from stage_service.devices.permission import lighting
 
 LitTimes = dict[int, deque[tuple[float, float]]]
 """By lamp, from when until when it was lit; kept beyond a connection, or duty would begin anew."""
@@ -19,7 +20,8 @@ AGAIN_S = 0.1
 
 
 class LimitedLightBank:
-    """Implements `LightBank` over `bank`; what exceeds `limits` raises `SafetyRefusal`.
+    """Implements `LightBank` over `bank`; what exceeds `limits` raises `SafetyRefusal`, and what
+    may light a lamp `NotPermitted` where the calling thread uses no live permission.
 
     A lamp that stays lit too long, or too much of the time, is put off by a thread of this bank.
     From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
@@ -67,13 +69,15 @@ class LimitedLightBank:
         self._bank.close()
 
     def select(self, lamp: int) -> None:
-        with self._changed:
-            self._allow((lamp,), f"putting lamp {lamp} on")
+        doing = f"putting lamp {lamp} on"
+        with lighting(doing), self._changed:
+            self._allow((lamp,), doing)
             self._bank.select(lamp)
 
     def all_on(self) -> None:
-        with self._changed:
-            self._allow(range(self.count), "putting all lamps on")
+        doing = "putting all lamps on"
+        with lighting(doing), self._changed:
+            self._allow(range(self.count), doing)
             self._bank.all_on()
 
     def off(self) -> None:
@@ -87,9 +91,10 @@ class LimitedLightBank:
             self._forget_what_did_not_come()
 
     def set_level(self, level: float) -> None:
-        with self._changed:
+        doing = f"setting the level to {level:g}"
+        with lighting(doing), self._changed:  # a lamp that is selected at level 0 would light
             self._raise_refusal()
-            self._check_power(len(self._since), level, f"setting the level to {level:g}")
+            self._check_power(len(self._since), level, doing)
             self._bank.set_level(level)
             self._level = level
 
@@ -115,7 +120,7 @@ class LimitedLightBank:
     ) -> None:
         """Check each entry and upload them. `times`: from when until when each is to be lit, in
         seconds from now; it counts as lit then, unless `off` comes before."""
-        with self._changed:
+        with lighting("arming a sequence of lamps"), self._changed:
             self._raise_refusal()
             now, spans = self._clock(), []
             for number, (lit, level) in enumerate(entries):

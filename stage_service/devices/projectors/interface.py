@@ -32,7 +32,8 @@ class Pattern:
 class ProjectorController(Protocol):
     """Shows scanlines. Safe to call from several threads.
 
-    Every call raises `DeviceError`; what the capabilities exclude raises it, too.
+    Every call raises `DeviceError`; what the capabilities exclude raises it, too. `line`, `all_on`
+    and `load_sequence` raise `NotPermitted` where the thread uses no live permission.
     """
 
     name: str

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from stage_service.config import PROJECTOR_LEVELS, SerialConfig
 from stage_service.devices.errors import DeviceError
+from stage_service.devices.permission import lighting
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities
 from stage_service.devices.serial_lines import Identity, SerialLines
 
@@ -46,10 +47,14 @@ class SerialProjectorController:
 
     def line(self, projector: str, row: int, level: float) -> None:
         shown = f"LINE {projector} {row} {_level(level)}"
-        self._lines.echo(shown, f"showing row {row} of {projector}")
+        doing = f"showing row {row} of {projector}"
+        with lighting(doing):
+            self._lines.echo(shown, doing)
 
     def all_on(self, level: float) -> None:
-        self._lines.echo(f"ON {_level(level)}", "showing all rows")
+        shown, doing = f"ON {_level(level)}", "showing all rows"
+        with lighting(doing):
+            self._lines.echo(shown, doing)
 
     def off(self) -> None:
         self._lines.echo("OFF", "putting the projectors dark")
@@ -62,7 +67,8 @@ class SerialProjectorController:
         the controller armed."""
         entries = [_text(run) for run in _runs(patterns)]
         words = ("SEQ", "ENTRY", "sequence", "entries")
-        self._lines.upload(words, entries, self.capabilities.table, len(patterns))
+        with lighting("arming a sequence of rows"):
+            self._lines.upload(words, entries, self.capabilities.table, len(patterns))
 
     def position(self) -> int:
         """How often the gate has closed since the sequence was armed."""

@@ -84,8 +84,9 @@ class TriggerBox(Protocol):
         the box has no table, or too short a one. Neighbours alike share a row of the table."""
 
     def go(self) -> None:
-        """Run the armed table from its first step. Never repeated on its own: the table of a lost
-        answer may run; `stop` ends it."""
+        """Run the armed table from its first step, which opens the gates of lamps and projectors.
+        Never repeated on its own: the table of a lost answer may run; `stop` ends it. Raises
+        `NotPermitted` where the thread uses no live permission."""
 
     def progress(self) -> TableProgress:
         """Where the table is; feeds the box's watchdog."""

@@ -10,6 +10,7 @@ from typing import cast, get_args
 
 from stage_service.config import SerialConfig
 from stage_service.devices.errors import DeviceError
+from stage_service.devices.permission import lighting
 from stage_service.devices.serial_lines import Identity, SerialLines
 from stage_service.devices.trigger.interface import (
     Gates,
@@ -73,7 +74,8 @@ class SerialTriggerBox:
 
     def go(self) -> None:
         """Run the armed table; raises `SafetyRefusal` where the box refuses to."""
-        self._lines.echo("GO", "starting the table")
+        with lighting("starting the table"):
+            self._lines.echo("GO", "starting the table")
 
     def progress(self) -> TableProgress:
         reply = f"SEQ <{'|'.join(get_args(TableState))}> <n> <n> <word>"

@@ -34,7 +34,7 @@ export function open(view) {
   const resume = steering("Resume", () => steer("resume"), { kind: "go", lights: true, ready: () => ["paused", "pausing"].includes(S.capture?.state) });
   const finish = steering("Shoot what is missing", () => steer("resume"), { lights: true, ready: () => S.capture?.state === "done" && !["completed", "damaged"].includes(S.capture?.outcome) });
   const fresh = h("a.button", { href: "#plan" }, "New capture");
-  const goOn = steering("Go on with the queue", () => ask("POST /queue:go-on"), { lights: true, ready: () => S.queue.held !== null });
+  const goOn = steering("Go on with the queue", () => release(S.queue.hold), { lights: true, ready: () => S.queue.hold !== null });
   const line = h("ol.queue");
   const queueSaid = h("p.quiet");
   view.append(h(".now",
@@ -53,6 +53,16 @@ export function open(view) {
   const waits = { step: null, slow: false, timer: 0 };
   const lacking = () => new Set((steps ?? []).filter((s) => (stepsAtEnd && !busy() && s.lacks.length && s.index < S.capture.step) || S.missing.some((x) => !x.shot_again && x.step === s.index)).map((s) => s.light).filter(Boolean));
 
+  /** End the hold that this page shows, once the person has read why it is there. */
+  async function release(hold) {
+    if (!hold || !confirm(`The queue is held:\n\n${hold.reasons.map((r) => `${clock(r.at)}  ${r.why}`).join("\n")}\n\nBegin what waits, one after the other?`)) return;
+    try {
+      await ask("POST /queue:go-on", { hold: hold.id });
+    } finally {
+      await load.queue();
+    }
+  }
+
   async function steer(action) {
     await ask(`POST ${captureAt(S.capture.id)}/${action}`, action === "resume" ? {} : undefined);
     await load.capture(S.capture.id);
@@ -65,7 +75,7 @@ export function open(view) {
     resume.element.hidden = !["paused", "pausing"].includes(c?.state);
     finish.element.hidden = busy() || !c || ["completed", "damaged"].includes(c.outcome) || unlit() !== null;
     fresh.hidden = unlit() !== null;
-    goOn.element.hidden = S.queue.held === null;
+    goOn.element.hidden = S.queue.hold === null;
     queueOf();
     if (!c) {
       headlineOfLamps();

@@ -18,7 +18,7 @@ export const S = {
   failed: null, // a capture that failed, until somebody has seen it
   missing: [], // frames of this capture that were shot again or given up
   lease: { holder: null, expires: null },
-  queue: { held: null, waits_for: null, waiting: [] },
+  queue: { held: null, hold: null, waits_for: null, waiting: [] },
   jobs: null,
   jobsProblem: null,
 };

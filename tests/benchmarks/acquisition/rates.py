@@ -26,6 +26,7 @@ from stage_service.acquisition.sequencer import Sequencer
 from stage_service.cli.support.children import Children
 from stage_service.config import RigFile, load_rig_file
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 from stage_service.plan.stepping import period_s
@@ -80,7 +81,8 @@ def run(out: Path, *, quick: bool = False, progress: Progress = silent) -> dict[
 
 def _lights(kind: str) -> dict[str, Any]:
     """Steps of one lamp on and off again, each confirmed as the link allows."""
-    with simulated(_rig(kind)) as rig_file:
+    permission = Permission.granted("a benchmark")
+    with simulated(_rig(kind)) as rig_file, permission.used():
         lights = DeviceSet.of(rig_file).lights
         lights.connect()
         lights.set_level(1.0)
@@ -156,7 +158,8 @@ def _capture(out: Path, stepping: str) -> dict[str, Any]:
         for attempt in range(2):
             folder = out / str(attempt)
             writer = CaptureWriter.create(folder, rig_file.rig, {"steps": steps})
-            sequencer = Sequencer(DeviceSet.of(rig_file), writer, plan)
+            permission = Permission.granted("a benchmark")
+            sequencer = Sequencer(DeviceSet.of(rig_file), writer, plan, permission=permission)
             cpu = time.process_time()
             outcome = sequencer.run()
             cpu = time.process_time() - cpu

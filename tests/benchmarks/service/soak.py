@@ -152,7 +152,7 @@ def _shoot(
         queue = live.ask("GET", "/queue")
         if queue["held"]:
             _finish(live)
-            live.ask("POST", "/queue:go-on")
+            _go_on(live)
         for _ in range(WAITING - len(queue["waiting"])):
             live.ask("POST", "/queue", {"plan": PLAN})
         going = live.ask("GET", "/health")["capture"]
@@ -230,7 +230,13 @@ def _empty(live: Live) -> None:
     if going := live.ask("GET", "/health")["capture"]:
         live.until_done(going)
     _finish(live)
-    live.ask("POST", "/queue:go-on")
+    _go_on(live)
+
+
+def _go_on(live: Live) -> None:
+    """Say that the queue may go on, whatever it was held for."""
+    if (hold := live.ask("GET", "/queue")["hold"]) is not None:
+        live.ask("POST", "/queue:go-on", {"hold": hold["id"]})
 
 
 def _judge(live: Live) -> dict[str, Any]:

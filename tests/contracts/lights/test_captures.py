@@ -13,6 +13,7 @@ from reconstruction import Capture, CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import LightBankConfig
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -44,7 +45,7 @@ def test_a_capture_over_a_bank_without_read_back(wire, simulated, small_rig, tmp
     plan = resolve(wanted, rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
     stage = DeviceSet.of(rig_file)
-    run = Sequencer(stage, writer, plan)
+    run = Sequencer(stage, writer, plan, permission=Permission.granted("a test"))
     run.run()
     assert run.outcome == "completed", run.error
     assert not world.lamps.power().any()

@@ -16,6 +16,7 @@ from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import blackout
 from stage_service.acquisition.sequencer import CannotPause, Sequencer
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
@@ -25,7 +26,11 @@ def sequencer(rig_file: Any, path: Path, heard: list[Any], **plan: Any) -> Seque
     writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
     assert "hardware" in {r.stepping for r in wanted.runs}
     return Sequencer(
-        DeviceSet.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event)
+        DeviceSet.of(rig_file),
+        writer,
+        wanted,
+        notify=lambda *event: heard.append(event),
+        permission=Permission.granted("a test"),
     )
 
 

@@ -13,6 +13,7 @@ from reconstruction import Capture, CaptureWriter, verify
 from stage_service.acquisition.sequencer import Sequencer
 from stage_service.config import RigFile
 from stage_service.devices.device_set import DeviceSet
+from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import ResolvedPlan, resolve
 
@@ -28,7 +29,11 @@ def sequencer(
     writer = CaptureWriter.create(path, rig_file.rig, {"steps": wanted.steps})
     heard: list[Any] = [] if events is None else events
     return Sequencer(
-        DeviceSet.of(rig_file), writer, wanted, notify=lambda *event: heard.append(event)
+        DeviceSet.of(rig_file),
+        writer,
+        wanted,
+        notify=lambda *event: heard.append(event),
+        permission=Permission.granted("a test"),
     )
 
 
@@ -115,7 +120,15 @@ def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world,
 
     world.double = set()
     writer = CaptureWriter.reopen(tmp_path / "c")
-    assert Sequencer(DeviceSet.of(rig_file), writer, in_software(rig_file)).run() == "completed"
+    assert (
+        Sequencer(
+            DeviceSet.of(rig_file),
+            writer,
+            in_software(rig_file),
+            permission=Permission.granted("a test"),
+        ).run()
+        == "completed"
+    )
     assert verify(tmp_path / "c") == []
     capture = Capture(tmp_path / "c")
     for step, light in zip((2, 3, 4), LIGHTS, strict=True):
@@ -265,7 +278,10 @@ def test_abort_keeps_what_is_finished_and_reopening_shoots_the_rest(rig_file, wo
     assert len(Capture(tmp_path / "c").records) == 15
     pulses = len(Capture(tmp_path / "c").steps) - 5
     again = Sequencer(
-        DeviceSet.of(rig_file), CaptureWriter.reopen(tmp_path / "c"), in_software(rig_file)
+        DeviceSet.of(rig_file),
+        CaptureWriter.reopen(tmp_path / "c"),
+        in_software(rig_file),
+        permission=Permission.granted("a test"),
     )
     assert again.run() == "completed"
     assert world.pulses == pulses

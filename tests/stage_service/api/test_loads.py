@@ -335,7 +335,7 @@ def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(
             assert_it_can_be_darkened(http, world, None)
         ask.join()
         (answer,) = answers
-        assert answer.json()["type"] == "/docs/errors.md#busy"
+        assert answer.json()["type"] == "/docs/errors.md#not-now"
         assert world.pulses == 0
         (listed,) = http.get("/captures").json()
         assert (listed["outcome"], listed["frames_written"]) == ("interrupted", 0)
@@ -454,7 +454,7 @@ def test_a_start_waits_for_no_capture_on_the_disk(rig_file, world, tmp_path, mon
             assert answer.headers["hairstage-unread"] == "2"
             assert http.get(f"/captures/{names[0]}").json()["outcome"] == "interrupted"
             assert http.get("/health").json()["unread"] == 1
-            http.post("/queue:go-on")
+            http.go_on()
             waiting = http.get("/queue").json()
             assert (len(waiting["waiting"]), "1 to come" in waiting["waits_for"]) == (1, True)
         finally:

@@ -13,7 +13,8 @@ from serving import Client, serving, slug
 from waiting import until
 
 from stage_service.captures import capture_queue
-from stage_service.captures.manager import Busy, CaptureManager
+from stage_service.captures.manager import CaptureManager
+from stage_service.captures.may_light import NotNow, Word
 from stage_service.cli import main
 from stage_service.config import SafetyLimits
 from stage_service.plan.capture_plan import CapturePlan
@@ -49,6 +50,7 @@ def ended(http: Client, number: int) -> list[dict[str, Any]]:
 
 
 def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
+    http.go_on()
     running = http.post("/captures", json={"plan": LONG}).json()["id"]
     a, b, c = (add(http, plan(i)) for i in range(3))
     first = add(http, {**plan(3), "place": 0})
@@ -64,7 +66,12 @@ def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
     shot = [(e["id"], e["capture"]) for e in history if e["state"] == "started"]
     assert shot == [(x["request"]["queue"], x["id"]) for x in by_start[:0:-1]]
     assert [e["id"] for e in history if e["state"] == "removed"] == [a]
-    assert http.get("/queue").json() == {"held": None, "waits_for": None, "waiting": []}
+    assert http.get("/queue").json() == {
+        "held": None,
+        "hold": None,
+        "waits_for": None,
+        "waiting": [],
+    }
     audit = [(x["who"], x["subject"]) for x in http.get("/audit").json()]
     assert len([who for who, subject in audit if "queue, for 127.0.0.1" in who]) == 3
     assert slug(http.patch(f"/queue/{a}", json={"place": 0})) == "unknown-entry"
@@ -73,6 +80,7 @@ def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
 
 @pytest.mark.parametrize("how", ["abort", "blackout", "failure"])
 def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(http, world, how):
+    http.go_on()
     running = http.post("/captures", json={"plan": LONG}).json()["id"]
     entry = add(http, plan(1))
     if how == "failure":
@@ -90,13 +98,14 @@ def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(ht
     http.service.events.wait(http.service.events.last, 1.2)
     assert world.pulses == pulses
     assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
-    assert http.post("/queue:go-on").json()["held"] is None
+    assert http.go_on().json()["held"] is None
     assert ended(http, 2)[1]["request"] == {"queue": entry}
 
 
 def test_who_aborts_what_is_not_there_or_over_is_told_the_truth(http):
     done = http.post("/captures", json=plan(3)).json()["id"]
     http.service._captures.wait(done, 30)
+    http.go_on()
     http.post("/lease", json={"holder": "Ada"})  # so that what waits does
     add(http, plan(4))
     assert slug(http.post("/captures/20260101-000000-0000/abort")) == "unknown-capture"
@@ -113,23 +122,24 @@ def test_nothing_begins_while_the_stage_is_latched_or_somebody_steers(http, worl
     entry = add(http, plan(1))
     assert "Ada steers" in http.get("/queue").json()["waits_for"]
     assert slug(http.post(f"/queue/{entry}/start")) == "leased"
-    assert slug(http.post("/queue:go-on")) == "leased"
+    assert slug(http.go_on()) == "leased"
     world.stuck_lamps, world.lit = True, {3}
     assert http.post("/devices/blackout").json()["safe"] is False
     http.delete("/lease", headers={"Hairstage-Lease": lease})
-    http.post("/queue:go-on")
+    http.go_on()
     assert "Nothing is lit until" in http.get("/queue").json()["waits_for"]
     assert slug(http.post(f"/queue/{entry}/start")) == "unsafe"
     assert http.get("/captures").json() == []
     world.stuck_lamps = False
     assert http.post("/devices/blackout").json()["safe"] is True
-    http.post("/queue:go-on")
+    http.go_on()
     assert ended(http, 1)[0]["outcome"] == "completed"
 
 
 def test_a_plan_that_flashes_is_started_by_somebody_who_answers_for_it(rig_file, world, tmp_path):
     living = replace(rig_file, safety=SafetyLimits(living_subject=True))
     with serving(living, tmp_path / "root") as http:
+        http.go_on()
         assert slug(http.post("/queue", json={"plan": IN_BAND})) == "flash-rate"
         flashing = add(http, {"plan": {**IN_BAND, "consent": CONSENT}})
         behind = add(http, {"plan": {**IN_BAND, "rate_hz": 2.5, "lights": ["light_003"]}})
@@ -163,7 +173,7 @@ def test_a_restart_keeps_what_waits_and_shoots_nothing_twice(rig_file, tmp_path)
         assert "by 127.0.0.1" in queue["held"]
         (known,) = http.get("/queue/history").json()
         assert (known["id"], known["capture"]) == (b, started["capture"])
-        http.post("/queue:go-on")
+        http.go_on()
         assert ended(http, 2)[1]["request"] == {"queue": a}
     (root / "queue.json").write_text('{"waiting": [')
     with serving(rig_file, root) as http:
@@ -194,10 +204,10 @@ def test_nothing_begins_after_a_service_that_died_in_a_capture(rig_file, tmp_pat
         assert capture["id"] in http.get("/queue").json()["held"]
         assert c in [e["id"] for e in http.get("/queue").json()["waiting"]]
         assert len(http.get("/captures").json()) == 1
-        http.post("/queue:go-on")
+        http.go_on()
         ended(http, 2 + (not then_removed) * 2)
     with serving(rig_file, root) as http:  # once somebody has said so, it is over
-        assert http.get("/queue").json()["held"] is None
+        assert capture["id"] not in http.get("/queue").json()["held"]
 
 
 def test_nothing_begins_after_a_service_that_was_ended_in_a_capture(rig_file, tmp_path):
@@ -208,7 +218,7 @@ def test_nothing_begins_after_a_service_that_was_ended_in_a_capture(rig_file, tm
     with serving(rig_file, root) as http:
         assert capture in http.get("/queue").json()["held"]
         assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
-        http.post("/queue:go-on")
+        http.go_on()
         ended(http, 2)
 
 
@@ -227,7 +237,7 @@ def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, t
     http.post("/queue:hold")
     entry = add(http, {**plan(1), "head": str(head)})
     head.unlink()
-    http.post("/queue:go-on")
+    http.go_on()
     assert "head.obj" in until(lambda: http.get("/queue").json()["held"])
     assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [entry]
     assert world.pulses == 0
@@ -241,7 +251,7 @@ def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
         refused = http.post("/queue/q-1/start")
         assert slug(refused) == "bad-input"
         assert "q-1 is what another version could shoot: plan.rows.step" in refused.json()["detail"]
-        http.post("/queue:go-on")
+        http.go_on()
         held = until(lambda: http.get("/queue").json()["held"])
         assert held.startswith("q-1 cannot begin: q-1 is what another version could shoot")
         assert "\n" not in held
@@ -250,10 +260,10 @@ def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
 def test_a_blackout_wins_over_a_capture_that_is_about_to_begin(rig_file, world, tmp_path):
     manager = CaptureManager(rig_file, tmp_path / "root")
     try:
-        since = manager.blackouts
+        word = Word(given=manager.moment())
         manager.blackout()
-        with pytest.raises(Busy, match="dark meanwhile"):
-            manager.start(CapturePlan(projectors=()), unless_dark_since=since)
+        with pytest.raises(NotNow, match="dark meanwhile"):
+            manager.start(CapturePlan(projectors=()), word=word)
         assert world.pulses == 0
     finally:
         manager.close()

@@ -190,7 +190,7 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
 
         # Whoever looked may still be there: it begins when somebody says so, and then by itself.
         assert "acknowledged" in http.get("/queue").json()["waits_for"]
-        assert http.post("/queue:go-on").is_success
+        assert http.go_on().is_success
         capture = until(lambda: http.get("/captures").json())[0]
         assert capture["request"] == {"queue": entry}
         assert done(http, capture["id"])["outcome"] == "completed"
@@ -366,7 +366,7 @@ def test_a_capture_of_a_plan_of_another_version_is_not_continued(http):
     assert done(http, capture)["outcome"] == "aborted"
 
 
-def test_the_stage_keeps_the_limits_of_the_rig_file(rig_file):
+def test_the_stage_keeps_the_limits_of_the_rig_file(rig_file, permitted):
     lights = DeviceSet.of(replace(rig_file, safety=SafetyLimits(max_lamps=5))).lights
     with pytest.raises(RuntimeError, match="max_lamps"):
         lights.all_on()

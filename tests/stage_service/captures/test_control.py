@@ -25,9 +25,9 @@ class Clock:
         return self.now
 
 
-def test_a_lease_ends_by_itself_and_is_renewed_from_now():
+def test_a_lease_ends_by_itself_and_is_renewed_from_now(tmp_path):
     clock = Clock()
-    leases = Leases(clock)
+    leases = Leases(tmp_path / "lease.json", clock)
     first = leases.take("Ada", 10)
     with pytest.raises(Leased, match="Ada steers the stage until"):
         leases.take("Eve", 10)

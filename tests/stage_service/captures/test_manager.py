@@ -22,7 +22,8 @@ from reconstruction import CaptureError, verify
 from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.states import WrongState
 from stage_service.captures.catalogue import UnknownCapture
-from stage_service.captures.manager import Busy, CaptureManager
+from stage_service.captures.manager import CaptureManager
+from stage_service.captures.may_light import Busy, NotNow
 from stage_service.config import RigFile
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError
@@ -39,6 +40,7 @@ def completed() -> list[Any]:
 @pytest.fixture
 def manager(rig_file: RigFile, tmp_path: Path, completed: list[Any]) -> Iterator[CaptureManager]:
     one = CaptureManager(rig_file, tmp_path / "service", completed.append)
+    one.stage.darken()
     yield one
     one.close()
 
@@ -159,7 +161,7 @@ def test_devices_are_asked_one_by_one(manager, world):
     assert devices["lights"]["estop_pressed"] is True
     assert devices["lights"]["count"] == 200
     assert devices["trigger"]["state"] == "unreachable"
-    assert "identifying: expected an identity" in devices["trigger"]["error"]
+    assert "identifying: expected a trigger box" in devices["trigger"]["error"]
     assert devices["projectors"]["names"] == ["left", "right"]
     assert devices["cameras"]["cam_2"]["gain"] == 10000.0
 
@@ -190,6 +192,7 @@ def test_a_follow_up_that_fails_is_told_and_the_capture_stays_completed(rig_file
         raise RuntimeError("no queue")
 
     manager = CaptureManager(rig_file, tmp_path / "service", broken)
+    manager.stage.darken()
     status = manager.wait(manager.start(SHORT), 20)
     assert status.outcome == "completed"
     event = until(manager, "capture.follow_up_failed")
@@ -199,7 +202,7 @@ def test_a_follow_up_that_fails_is_told_and_the_capture_stays_completed(rig_file
 
 def test_a_closed_manager_starts_nothing(manager):
     manager.close()
-    with pytest.raises(Busy):
+    with pytest.raises(NotNow, match="the service is closing"):
         manager.start(SHORT)
 
 
@@ -274,6 +277,7 @@ from stage_service.captures.manager import CaptureManager
 from stage_service.config import load_rig_file
 from stage_service.plan.capture_plan import CapturePlan
 manager = CaptureManager(load_rig_file(sys.argv[1]), Path(sys.argv[2]))
+manager.stage.darken()
 manager.start(CapturePlan(projectors=()))
 while manager.events.last < 12:
     manager.events.wait(manager.events.last, 1.0)

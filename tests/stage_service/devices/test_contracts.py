@@ -18,6 +18,7 @@ from stage_service.acquisition.safety import blackout
 from stage_service.config import RigFile, load_rig_file
 from stage_service.devices.device_set import DeviceSet
 
+pytestmark = pytest.mark.usefixtures("permitted")
 CHECKOUT = Path(__file__).resolve().parents[3]
 NEVER = threading.Event()
 RIG = """

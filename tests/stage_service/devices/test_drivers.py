@@ -35,6 +35,7 @@ from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
+pytestmark = pytest.mark.usefixtures("permitted")
 NEVER = threading.Event()
 
 

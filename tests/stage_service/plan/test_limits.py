@@ -28,6 +28,7 @@ from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.limits import longest_on
 from stage_service.plan.resolved import PlanError, resolve
 
+pytestmark = pytest.mark.usefixtures("permitted")
 RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 LAMPS = 10
 
