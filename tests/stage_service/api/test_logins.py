@@ -293,6 +293,35 @@ print(again.blackout_by(right), len(again.tokens_of([again.begin("ada", place)],
 """
 
 
+LATE = """
+import sys, time
+from pathlib import Path
+from stage_service.records.logins import Logins
+
+root, place = Path(sys.argv[1]), "localhost:1"
+with (root / "filler").open("wb", buffering=0) as filler:
+    try:
+        while filler.write(bytes(4096)):
+            pass
+    except OSError:
+        pass
+logins = Logins(root)
+first, right = logins.begin("ada", place), logins.blackout_right("ada")
+print(len(logins.tokens_of([first], place)), logins.blackout_by(right))
+(root / "filler").unlink()
+while not (root / "login.key").exists():
+    logins.begin("ada", place)
+    time.sleep(0.01)
+print(Logins(root).blackout_by(right))
+"""
+
+
+def test_a_key_that_a_full_disk_did_not_take_is_stored_later(tmp_path):
+    require_small_disk(tmp_path)
+    done = on_small_disk(tmp_path, sys.executable, "-c", LATE, str(tmp_path))
+    assert done.stdout.splitlines() == ["1 ada", "ada"], done.stderr
+
+
 @pytest.mark.parametrize("disk", ["full", "readonly"])
 def test_a_disk_that_takes_nothing_locks_nobody_out(tmp_path, disk):
     """Of a full one the file of logouts goes: no logout is forgotten by a restart. A read-only one
