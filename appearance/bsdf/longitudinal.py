@@ -19,8 +19,6 @@ LEAST_VARIANCE = 1e-7
 """Smallest longitudinal variance; a lobe of 0.02 degrees."""
 GREATEST_VARIANCE = 110.0
 """Largest longitudinal variance: the TRT lobe's 4v at beta_m = 1 is 109.8."""
-MOST_SCATTER = 2 / 3
-"""Of a lobe's variance, what scattered directions may be before the fibres' is told."""
 LEAST_COLOUR = 1e-6
 """Multiple-scattering albedo below which a channel counts as black."""
 
@@ -50,19 +48,6 @@ def log_longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Ar
 def longitudinal(theta_i: ArrayLike, theta_o: ArrayLike, v: ArrayLike) -> Array:
     """The lobe M of `log_longitudinal`, of their broadcast shape; 0 where it underflows."""
     return np.exp(log_longitudinal(theta_i, theta_o, v))
-
-
-def roughness_without_scatter(beta_m: float, scatter: float) -> float | None:
-    """The fibres' roughness, where `beta_m` was read through tangents that are off.
-
-    An inclination that is off by ε moves a highlight by 2ε, so the lobe of all together has the
-    variance v + 4ε²; `scatter` is ε, root mean square, in radians. None where scatter is over
-    `MOST_SCATTER` of the variance: a small error of ε would be a large one of the rest.
-    """
-    whole, off = float(variance_of_roughness(beta_m)), 4 * scatter**2
-    if off > MOST_SCATTER * whole:
-        return None
-    return float(roughness_of_variance(max(whole - off, LEAST_VARIANCE)))
 
 
 def variance_of_roughness(beta_m: ArrayLike) -> Array:

@@ -126,7 +126,8 @@ class FittedModel:
                 hair=hair,
                 colour=(red, green, blue),
                 v=v,
-                fibres=None,
+                beta_m_error=None,
+                beta_m_interval=None,
                 sigma_a_error=None,
             )
         model.create().write_strands(self.strands)

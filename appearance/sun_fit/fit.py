@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from itertools import count as count_from
 
 import numpy as np
 
 from appearance.bsdf.longitudinal import (
     absorption_of_colour,
     roughness_of_variance,
-    roughness_without_scatter,
     variance_of_roughness,
 )
 from appearance.metrics.scores import Exposure
@@ -22,15 +20,6 @@ from appearance.render.olat import render_olat
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import HairAppearance
 from appearance.scene.hair_scene import HairScene, build_scene
-from appearance.sun_fit.disorder import (
-    TOLD_DEG,
-    Disorder,
-    Likeness,
-    PixelPairs,
-    direct_share,
-    disordered,
-    match_disorder,
-)
 from appearance.sun_fit.fit_pixels import (
     COVERED,
     FitPixels,
@@ -39,14 +28,12 @@ from appearance.sun_fit.fit_pixels import (
     observed_pixels,
     reached,
 )
-from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance, absorption_warnings
+from appearance.sun_fit.fitted_appearance import FittedAppearance, absorption_warnings
 from appearance.sun_fit.highlights import WINDOW, Highlight, Highlights
 from appearance.sun_fit.light_correlation import Roughness, match_roughness
 from appearance.sun_fit.mirror_samples import (
     MirrorSamples,
-    answers,
     binned,
-    lobes,
     mirror_lights,
     mirror_samples,
     usable,
@@ -73,16 +60,7 @@ MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
 ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
-"""β_M of the renderings of the strands as they are; nothing outside is found."""
-NEARER = (0.45, 0.65, 0.85, 1.1, 1.6)
-"""Those of disordered strands, as factors on the answer of the first."""
-DISORDERS = (0.0, 12.0, 18.0, 24.0)
-"""Degrees by which strands are turned, each in another draw; by no more than the last."""
-DISORDER = 1.6
-"""Turn of single strands over the error of a pixel's mean inclination, where nothing tells it.
-
-√2 for the two ways across, and more, as a pixel's mean is one of several strands.
-"""
+"""β_M of the renderings; no value outside their range is found."""
 ROUGHNESS_PIXELS = 350
 """Pixels a camera, at most, whose own highlights are matched."""
 
@@ -113,22 +91,16 @@ def fit(
         pixels = observed_pixels(training, model, options, stage, progress, seed)
         exposure = Exposure.of([o.radiance[o.valid] for o in pixels.hair])
         pixels = reached(training, pixels, exposure, stage)
-    start = HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N)
     head = model.head(capture)
-    scene = build_scene(strands, head, hair=start)
-    fitting = SunFit(
-        scene,
-        pixels,
-        options,
-        seed,
-        progress,
-        lambda angle, draw: build_scene(disordered(strands, angle, seed + draw), head, hair=start),
-    )
+    scene = build_scene(strands, head, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N))
+    fitting = SunFit(scene, pixels, options, seed, progress)
     with report.stage("roughness") as stage:
         found = fitting.roughness(stage)
-        beta_m, first = found.as_are.beta_m, found.first
+        stage.warn(found.matched.limit())
+        roughness, first = found.matched, found.first
     with report.stage("colour") as stage:
-        colours = fitting.colour(beta_m, np.array(first.colour), np.array(first.skin), stage)
+        start = np.array(first.colour), np.array(first.skin)
+        colours = fitting.colour(roughness.beta_m, *start, stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
@@ -144,12 +116,10 @@ def fit(
                 "intensities, to know it"
             )
     made = (colours.hair, colours.colour, colours.skin, exposure)
-    variances = float(variance_of_roughness(beta_m)), found.plain.v, found.printed
-    fibres = found.fibres
-    turns = () if (d := fibres.disorder) is None else (d.degrees, d.low, d.high)
-    known = Fibres(fibres.beta_m, fibres.error, fibres.low, fibres.high, *turns)
+    variances = float(variance_of_roughness(roughness.beta_m)), found.plain.v, found.printed
+    spread = roughness.error, (roughness.low, roughness.high), (red, green, blue)
     model.forget_appearance()
-    FittedAppearance(*made, *variances, held_out, known, (red, green, blue)).save(model)
+    FittedAppearance(*made, *variances, held_out, *spread).save(model)
     for stale in ("inverse_rendering", "field", "images"):
         report.drop(stale)
     model.write_report(report)
@@ -165,15 +135,14 @@ def _spread(observed: Observed) -> Ints:
 
 @dataclass(frozen=True)
 class Roughnesses:
-    """What the highlights tell.
+    """The roughness by three methods.
 
-    `as_are` is the roughness to render the strands with, `fibres` that of strands as disordered as
-    the hair is, `plain` the lobe of the capture's own samples, `printed` the variance by Eq. 10 as
-    it is printed, `first` the colour that went into the renderings.
+    `matched` is that of the renderings that match the capture, `plain` the lobe of the capture's
+    own samples, `printed` the variance by Eq. 10 as it is printed, `first` the colour that went
+    into the renderings.
     """
 
-    as_are: Roughness
-    fibres: Roughness
+    matched: Roughness
     plain: Lobe
     printed: float
     first: Colours
@@ -181,22 +150,19 @@ class Roughnesses:
 
 @dataclass(frozen=True)
 class SunFit:
-    """The observations and the geometry that the two fits share.
-
-    `disordered` makes the scene of strands whose tangents are turned by so many radians RMS, in a
-    numbered draw, for strands that were reconstructed; without it they are taken to be exact.
-    """
+    """The observations and the geometry that the fits of roughness and colour share."""
 
     scene: HairScene
     pixels: FitPixels
     options: FitOptions
     seed: int
     progress: Progress
-    disordered: Callable[[float, int], HairScene] | None = None
 
     def roughness(self, stage: Stage) -> Roughnesses:
-        """The roughnesses by matched renderings; raises `ValueError` where no light tells one."""
-        start = time.perf_counter()
+        """The roughness by matched renderings.
+
+        Raises `ValueError` if no light lies near a mirror direction.
+        """
         self.progress("measuring the highlight", 0.3)
         hair = self.pixels.hair
         step = max(1, len(hair) // self.options.roughness_cameras)
@@ -214,53 +180,22 @@ class SunFit:
                 "lights"
             )
         mean: Array = np.sum([o.radiance.mean((0, 1)) for o, _ in views], axis=0)
-        channel = int(np.argmin(np.where(mean > 0, mean, np.inf)))  # a black one tells nothing
+        # a black channel has no highlight
+        channel = int(np.argmin(np.where(mean > 0, mean, np.inf)))
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
-        skin, unseen = np.array(self.scene.skin), Stage("first colour")
+        skin, unreported = np.array(self.scene.skin), Stage("first colour")
         # that of all light: near a highlight, what comes from other fibres does from all sides
-        first = self.colour(plain.beta_m, None, skin, unseen, pixels=self.covered)
+        first = self.colour(plain.beta_m, None, skin, unreported, pixels=self.covered)
         captured, highlights = self._highlights(views, channel)
-        series = Series("roughness", "standard error of log β_M")
-        stage.series.append(series)
-        runs = count_from(1)
 
-        def rendered(scene: HairScene, beta: float, max_depth: int = MAX_DEPTH) -> Highlight:
-            number = next(runs)
-            self.progress("matching the highlight", 0.5 + number / 80)
-            lit = scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
-            return highlights.of(
-                [self._halves(lit, o, number, max_depth) for o, _ in highlights.views]
-            )
+        def rendered(number: int, beta: float) -> Highlight:
+            self.progress("matching the highlight", 0.5 + number / 40)
+            lit = self.scene.with_hair(replace(first.hair, beta_m=beta)).with_skin(first.skin)
+            return highlights.of([self._halves(lit, o, number) for o, _ in highlights.views])
 
-        def matched(scene: HairScene, roughnesses: Iterable[float]) -> Roughness:
-            each = map(float, roughnesses)
-            family[:] = [(beta, rendered(scene, beta)) for beta in each]
-            found = match_roughness(captured, family)
-            series.points.append((time.perf_counter() - start, found.error))
-            return found
-
-        family: list[tuple[float, Highlight]] = []
-        as_are = matched(self.scene, ROUGHNESSES)
-        nearer = np.clip(np.array(NEARER) * as_are.beta_m, ROUGHNESSES[0], ROUGHNESSES[-1])
-        if self.disordered is None:
-            as_are = fibres = matched(self.scene, np.unique(nearer))
-        else:
-            # the turns depend on the roughness a little: without what the tangents' error adds
-            smoother = roughness_without_scatter(
-                as_are.beta_m, float(np.radians(as_are.tangents_deg))
-            )
-            beta = max(smoother or as_are.beta_m, ROUGHNESSES[0])
-            share = direct_share(rendered(self.scene, beta, 1), rendered(self.scene, beta))
-            disorder = self._disorder(self.disordered, channel, beta, share)
-            if disorder is None:
-                off = DISORDER * as_are.tangents_deg
-            else:
-                # in the midst of the squares that change most, so that little is extrapolated
-                middle = np.hypot(disorder.degrees, disorder.high) / 2**0.5
-                off = max(float(middle), TOLD_DEG)
-            turned = matched(self.disordered(float(np.radians(off)), 0), np.unique(nearer))
-            fibres = as_are.of_fibres(turned, off, disorder)
+        family = [(beta, rendered(k, beta)) for k, beta in enumerate(ROUGHNESSES, 1)]
+        found = match_roughness(captured, family)
         stage.figures |= {
             "samples": count,
             "pairs_of_lights": int(captured.pairs.sum()),
@@ -270,19 +205,17 @@ class SunFit:
             "sun_v_as_printed": printed,
             "sun_beta_m_as_printed": float(roughness_of_variance(printed)),
             "lobe_residual": plain.residual,
-            "rendered_beta_m": as_are.beta_m,
-            **asdict(replace(fibres, disorder=None)),
-            "disorder": None if fibres.disorder is None else fibres.disorder.figures(),
-            "range": list(fibres.range),
-            "views": list(fibres.views),
+            **asdict(found),
+            "range": list(found.range),
+            "views": list(found.views),
             "correlation_deg": float(np.degrees(captured.angle())),
             "rendered_correlation_deg": [
                 [beta, float(np.degrees(highlight.angle()))] for beta, highlight in family
             ],
         }
-        for warning in fibres.warnings():
+        for warning in found.warnings():
             stage.warn(warning)
-        return Roughnesses(as_are, fibres, plain, printed, first)
+        return Roughnesses(found, plain, printed, first)
 
     @cached_property
     def covered(self) -> FitPixels:
@@ -399,28 +332,6 @@ class SunFit:
         highlights = Highlights(few, self._tilt, channel)
         return highlights.of([np.stack([o.radiance, o.radiance]) for o, _ in few]), highlights
 
-    def _disorder(
-        self, turned: Callable[[float, int], HairScene], channel: int, beta: float, share: float
-    ) -> Disorder | None:
-        """By how much single hairs of roughness `beta` turn more than the strands."""
-        self.progress("comparing pixels", 0.6)
-        views = self._views(self.pixels.clusters)
-        pairs = [PixelPairs.of(o, fibres, self._tilt) for o, fibres in views]
-        v = float(variance_of_roughness(beta))
-
-        def computed(number: int, degrees: float) -> Likeness:
-            scene = turned(float(np.radians(degrees)), number) if degrees else self.scene
-            of_views = []
-            for (o, _), p in zip(views, pairs, strict=True):
-                seen = visible_fibres(scene, o.camera, o.pixels, seed=self.seed + 1)
-                of_views.append(p.likeness(*lobes(o, seen, v, self._tilt, p.at)))
-            return Likeness.joined(of_views)
-
-        known = ((p, answers(o, f, channel, p.at)) for (o, f), p in zip(views, pairs, strict=True))
-        captured = Likeness.joined([p.likeness(values, values) for p, values in known])
-        each = ((degrees, computed(k, degrees)) for k, degrees in enumerate(DISORDERS))
-        return match_disorder(captured, each, share)
-
     def _read(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
     ) -> tuple[Lobe, float, int]:
@@ -428,10 +339,10 @@ class SunFit:
         bins = binned(MirrorSamples.joined(parts))
         return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
 
-    def _halves(self, scene: HairScene, o: Observed, number: int, max_depth: int) -> Floats:
+    def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
         """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
         spp = max(self.options.roughness_spp // 2, 1)
-        spent = asdict(Sampling(spp, max_depth, self.seed + (number << 11)))
+        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 11)))
         twice = np.tile(o.pixels, 2)
         images = render_olat(scene, o.camera, o.lights, pixels=twice, **spent)
         return np.stack(np.split(images, 2, axis=1))

@@ -1,4 +1,4 @@
-"""Which pixels of a capture a fit reads: hair, skin, and hair beside other hair."""
+"""Which pixels of a capture a fit reads: hair and skin."""
 
 from __future__ import annotations
 
@@ -11,29 +11,22 @@ from appearance.metrics.scores import Exposure
 from appearance.observations import Observed, chosen, observe
 from appearance.render.coverage import pixel_coverage
 from appearance.scene.hair_scene import SCALE, HairScene
-from appearance.sun_fit.disorder import BESIDE
 from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model, Progress, Stage
-from reconstruction.arrays import Array, Bools, Ints
+from reconstruction.arrays import Array
 
 SKIN_PIXELS = 200
-"""Pixels a camera that tell the skin's colour."""
-COMPARED_PIXELS = 1500
-"""Pixels a camera, about, that are compared with others beside them."""
+"""Skin pixels read from each camera."""
 COVERED = 0.9
 """Share of a pixel that the model's hair, or skin, covers where colours are compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitPixels:
-    """What the cameras observed: hair, skin where they see some, and hair in `clusters`.
-
-    Pixels of a cluster lie `BESIDE` each other.
-    """
+    """What the cameras observed: hair, and skin where any is visible."""
 
     hair: Sequence[Observed]
     skin: Sequence[Observed] = ()
-    clusters: Sequence[Observed] = ()
 
 
 def observed_pixels(
@@ -50,23 +43,19 @@ def observed_pixels(
     """
     rng = np.random.default_rng(seed)
     cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
-    hair, clusters, skin, seen = [], [], [], 0
+    hair, skin, hair_pixels = [], [], 0
     has_head = model.head(training) is not None
     for i, name in enumerate(cameras):
         progress("reading hair pixels", 0.3 * i / len(cameras))
         mask = model.mask(name, "hair", training)
         bare = model.mask(name, "skin", training) & ~mask
-        seen += int(mask.sum())
-        alone = chosen(mask, options.hair_pixels, rng)
-        some = chosen(mask, COMPARED_PIXELS // (1 + len(BESIDE)), rng)
-        compared = np.concatenate([some, _beside(some, mask)])
-        wanted = np.union1d(alone, compared)
+        hair_pixels += int(mask.sum())
+        wanted = chosen(mask, options.hair_pixels, rng)
         uncovered = chosen(bare if has_head else bare & False, SKIN_PIXELS, rng)
         both = observe(training, name, lights, np.concatenate([wanted, uncovered]))
         is_hair = np.arange(len(both.pixels)) < len(wanted)
         if len(wanted):
-            hair.append(both.where(is_hair & np.isin(both.pixels, alone)))
-            clusters.append(both.where(is_hair & np.isin(both.pixels, compared)))
+            hair.append(both.where(is_hair))
         if len(uncovered) >= 10:
             skin.append(both.where(~is_hair))
         if missing := int((~both.valid.any(axis=1)).sum()):
@@ -80,13 +69,13 @@ def observed_pixels(
         )
     kept = sum(len(o.pixels) for o in hair)
     stage.figures |= {"cameras": len(cameras), "lights": len(lights), "hair_pixels": kept}
-    if kept < seen:
+    if kept < hair_pixels:
         stage.leave_out(
-            f"{seen - kept} of {seen} hair pixels",
+            f"{hair_pixels - kept} of {hair_pixels} hair pixels",
             "means and lobes are known to a per cent from the others",
-            f"{1 - kept / seen:.0%} of the renderings",
+            f"{1 - kept / hair_pixels:.0%} of the renderings",
         )
-    return FitPixels(hair, skin, clusters)
+    return FitPixels(hair, skin)
 
 
 def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
@@ -110,8 +99,7 @@ def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Sta
     if len(lit) == 0:
         raise ValueError(f"{training.path}: no light reaches a hair pixel")
     stage.figures["lights_that_reach_hair"] = len(lit)
-    each = (pixels.hair, pixels.skin, pixels.clusters)
-    return FitPixels(*([o.under(lit) for o in some] for some in each))
+    return FitPixels(*([o.under(lit) for o in some] for some in (pixels.hair, pixels.skin)))
 
 
 def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
@@ -128,7 +116,7 @@ def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
         enough = 10 * left >= sum(len(o.pixels) for o in views)
         return [o for o in shown if len(o.pixels)] if enough else views
 
-    return FitPixels(of(pixels.hair, "hair"), of(pixels.skin, "head"), pixels.clusters)
+    return FitPixels(of(pixels.hair, "hair"), of(pixels.skin, "head"))
 
 
 def in_front(pixels: FitPixels, scene: HairScene) -> FitPixels:
@@ -151,14 +139,3 @@ def cosines_of_lights(scene: HairScene, o: Observed) -> Array:
     towards = o.camera.center - middle
     lengths = np.linalg.norm(ways, axis=1) * np.linalg.norm(towards)
     return np.asarray(ways @ towards / np.maximum(lengths, 1e-12))
-
-
-def _beside(pixels: Ints, mask: Bools) -> Ints:
-    """Those of `mask` that lie `BESIDE` a pixel of `pixels`: right of every second, else below."""
-    width, found = mask.shape[1], []
-    for apart in BESIDE:
-        found.append(pixels[::2][pixels[::2] % width + apart < width] + apart)
-        below = pixels[1::2] + apart * width
-        found.append(below[below < mask.size])
-    either = np.concatenate(found)
-    return either[mask.ravel()[either]]

@@ -1,4 +1,4 @@
-"""What Sun's fit leaves in a model: `appearance.json`."""
+"""The result of Sun's fit in a model: `appearance.json`."""
 
 from __future__ import annotations
 
@@ -13,35 +13,18 @@ from appearance.observations import HeldOut
 from appearance.scene.hair_appearance import HairAppearance
 from reconstruction import Model, ModelError
 
+_Interval = tuple[float, float]
 _Errors = tuple[float | None, float | None, float | None]
 
 UNCERTAIN = 0.2
 """Standard error of log sigma_a above which a user is warned."""
 
 
-@dataclass(frozen=True)
-class Fibres:
-    """The roughness of the hair's fibres, whatever the strands that stand for them.
-
-    `error` is the standard error of log β_M, `low` and `high` the ends of an interval of about
-    95 %. `disorder_deg` is by how much single hairs turn beyond the model's strands, root mean
-    square, and the next two the ends of its interval; None where that was not measured.
-    """
-
-    beta_m: float
-    error: float
-    low: float
-    high: float
-    disorder_deg: float | None = None
-    disorder_low_deg: float | None = None
-    disorder_high_deg: float | None = None
-
-
 def absorption_warnings(sigma_a: Sequence[float], errors: Sequence[float | None]) -> list[str]:
-    """What a user has to know of an absorption (3,) with these relative errors to believe it."""
+    """Which channels of an absorption (3,) with these relative errors are uncertain."""
     return [
         f"sigma_a of {name}, {value:.2g}, "
-        + ("cannot be told from the colour" if e is None else f"is uncertain by {e:.0%}")
+        + ("cannot be estimated from the colour" if e is None else f"is uncertain by {e:.0%}")
         for name, value, e in zip(("red", "green", "blue"), sigma_a, errors, strict=True)
         if e is None or e > UNCERTAIN
     ]
@@ -52,13 +35,13 @@ class FittedAppearance:
     """A model's appearance.
 
     `hair` is what to render the model's strands with: strands that are smoother than hair are
-    rendered rougher than its `fibres` are. `colour (3,)` is the multiple-scattering albedo behind
+    rendered rougher than its fibres are. `colour (3,)` is the multiple-scattering albedo behind
     its absorption, `skin (3,)` a diffuse albedo, `exposure` the capture's. `v` is the longitudinal
     variance behind `hair.beta_m`; `plain_v` and `printed_v` are what the captured lobe reads before
     the correction by rendering, with a floor and (as Sun's Eq. 10) without. `held_out` is what
-    the fit did not observe. `sigma_a_error (3,)` is the standard error of log sigma_a, None where
-    the hair's colour does not answer to it. `fibres` and `sigma_a_error` are None where `hair` is
-    not what was fitted.
+    the fit did not observe. `beta_m_error` is the standard error of log β_M, `beta_m_interval` an
+    interval of about 95 %, and `sigma_a_error (3,)` the standard error of log sigma_a, None in a
+    channel whose colour does not depend on it. All three are None if `hair` was not fitted.
     """
 
     hair: HairAppearance
@@ -69,7 +52,8 @@ class FittedAppearance:
     plain_v: float
     printed_v: float
     held_out: HeldOut
-    fibres: Fibres | None = None
+    beta_m_error: float | None = None
+    beta_m_interval: _Interval | None = None
     sigma_a_error: _Errors | None = None
 
     def save(self, model: Model) -> None:
@@ -79,10 +63,7 @@ class FittedAppearance:
 
     @classmethod
     def is_of(cls, model: Model, held_out: HeldOut) -> bool:
-        """Whether the model has an appearance whose fit left out these cameras and lights.
-
-        One that cannot be read, or is of an earlier version, is none: it has to be fitted again.
-        """
+        """Whether a model has a readable appearance that was fitted without these frames."""
         try:
             made = cls.load(model).held_out
         except ModelError:
@@ -107,8 +88,9 @@ class FittedAppearance:
                 float(data["plain_v"]),
                 float(data["printed_v"]),
                 HeldOut(*(tuple(data["held_out"][k]) for k in ("cameras", "lights"))),
-                TypeAdapter(Fibres | None).validate_python(data["fibres"]),
-                TypeAdapter(_Errors | None).validate_python(data["sigma_a_error"]),
+                TypeAdapter(float | None).validate_python(data.get("beta_m_error")),
+                TypeAdapter(_Interval | None).validate_python(data.get("beta_m_interval")),
+                TypeAdapter(_Errors | None).validate_python(data.get("sigma_a_error")),
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             path = model.file("appearance.json")

@@ -2,36 +2,29 @@
 
 An error ε of a tangent's inclination moves the pixel's whole highlight by 2ε, so the mean profile
 over many pixels is wider than the lobe and its roughness too large. The product of a pixel's
-answers to two lights near its mirror direction, averaged over the angle Δ between them, does not
-ask where the highlight is: its width over Δ is the lobe's. For broad lobes, where Δ does not reach
-far enough, the profile decides, with the spread of its shifts as an unknown. Renderings of known
-roughness are measured in the same way; the roughness is where theirs meet the capture's.
+responses to two lights near its mirror direction, averaged over the angle Δ between them, does not
+depend on where the highlight is: its width over Δ is the lobe's. For broad lobes, where Δ does not
+reach far enough, the profile decides, with the spread of its shifts as an unknown. Renderings of
+known roughness are measured in the same way; the roughness is the one whose renderings match.
 
-Reconstructed strands may be smoother than hair: a pixel of theirs then mixes fewer directions,
-which the products do see. The renderings for the fibres' own roughness are of strands as disordered
-as the hair is (`disorder`).
+Reconstructed strands may be smoother than hair. A pixel of theirs then mixes fewer directions, and
+the roughness that matches is larger than that of the fibres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from appearance.bsdf.longitudinal import roughness_of_variance, variance_of_roughness
-from appearance.sun_fit.disorder import Disorder
 from appearance.sun_fit.hair_parts import FEWEST_PAIRS, errors, leaving_out
 from appearance.sun_fit.highlights import INNER, SHIFTS, Highlight
 from reconstruction.arrays import Array
 
 WIDEST = 1.5
-"""Ratio of the interval's ends above which a roughness is called uncertain."""
-SURE = 0.87
-"""Of a roughness, how low it may be without a warning that turns do not show."""
-UNMEASURED = 1.5
-"""Over the square of the turn that the tangents' error makes likely: how much it may be."""
+"""Ratio of the interval's ends above which a roughness is uncertain."""
 LARGEST_ERROR = 0.1
 WORST_MISFIT = 3.0
 _FLOOR = 0.02  # what a mean of a bin is off by at least, of the mean over bins
@@ -41,15 +34,13 @@ _STEPS = 400
 
 @dataclass(frozen=True)
 class Roughness:
-    """A roughness with what is known of its error.
+    """The roughness to render strands with, and its error.
 
     `error` is the standard error of log β_M: the larger of those over parts of the hair (`parts`)
-    and between views, and `systematic`. `low`, `high` are the ends of an interval of about 95 %,
-    inside `range`, that of the renderings. `views` are the answers of single views that have pairs
-    enough. `misfit` is the χ² of the best match per degree of freedom. `tangents_deg` is how far
-    inclinations are off, root mean square, more than in the renderings, and `tangents_error_deg`
-    its standard error. `disorder` is by how much the rendered strands were disordered; None where
-    no two pixels beside each other told.
+    and between views. `low`, `high` are the ends of an interval of about 95 %, inside `range`, that
+    of the renderings. `views` are the estimates of single views that have enough pairs. `misfit` is
+    the χ² of the best match per degree of freedom. `tangents_deg` is how far inclinations are off,
+    root mean square, more than in the renderings, and `tangents_error_deg` its standard error.
     """
 
     beta_m: float
@@ -62,100 +53,40 @@ class Roughness:
     misfit: float
     tangents_deg: float
     tangents_error_deg: float
-    systematic: float = 0.0
-    disorder: Disorder | None = None
-
-    def of_fibres(self, turned: Roughness, degrees: float, disorder: Disorder | None) -> Roughness:
-        """That of the fibres of hair in `disorder`, of this one, by the strands as they are.
-
-        `turned` is the answer of strands that are turned by so many `degrees`. What a turn adds to
-        the lobe's variance grows with its square; the answer is the mean of log β_M over the
-        squares that are believed, the interval holds 95 % of them and what either answer is off by.
-        Turns that leave fibres less than the least roughness that was rendered are not believed;
-        where pixels differ by more than those that were tried do, the interval reaches down to it.
-        Where no disorder was measured, any square up to 1.5 times that of `degrees` is as likely.
-        The tangents' error and the misfit are those of the strands as they are: such that wave by
-        themselves fit a highlight less well than those that stand where the hair is.
-        """
-        if disorder is None:
-            share = np.linspace(0, UNMEASURED, 100)
-        else:
-            share = np.array(disorder.squares) / degrees**2
-        least, most = turned.range
-        own, other = variance_of_roughness(np.array([self.beta_m, turned.beta_m]))
-        v = np.minimum(own + (other - own) * share, variance_of_roughness(most))
-        possible = v >= variance_of_roughness(least)
-        v = v[possible] if possible.any() else variance_of_roughness([least])
-        log_beta = np.log(roughness_of_variance(v))
-        answer = float(log_beta.mean())
-        weight = float(np.clip(share[possible].mean(), 0, 1)) if possible.any() else 1.0
-
-        def mean(of: Callable[[Roughness], float]) -> float:
-            return (1 - weight) * of(self) + weight * of(turned)
-
-        down, up = (abs(answer - np.percentile(log_beta, q)) for q in (2.5, 97.5))
-        low = answer - np.hypot(down, mean(lambda r: np.log(r.beta_m / r.low)))
-        high = answer + np.hypot(up, mean(lambda r: np.log(r.high / r.beta_m)))
-        to_low, to_high = (turned if weight > 0.5 else self).ends()
-        if to_low or possible.mean() < 0.5 or (disorder is not None and disorder.beyond):
-            low = np.log(least)
-        low, high = max(low, np.log(least)), np.log(most) if to_high else min(high, np.log(most))
-        alone = mean(lambda r: r.error)
-        error = float(max(np.hypot(alone, log_beta.std()), 0.5 * (answer - low)))
-        return replace(
-            self,
-            beta_m=float(np.exp(answer)),
-            error=error,
-            low=float(np.exp(low)),
-            high=float(np.exp(high)),
-            range=turned.range,
-            parts=mean(lambda r: r.parts),
-            views=tuple(view * float(np.exp(answer)) / self.beta_m for view in self.views),
-            systematic=float(np.sqrt(error**2 - alone**2)),
-            disorder=disorder,
-        )
 
     def ends(self) -> tuple[bool, bool]:
         """Whether the interval reaches the lower and the upper end of what was rendered."""
         return self.low <= self.range[0] * 1.001, self.high >= self.range[1] / 1.001
 
+    def limit(self) -> str:
+        """What the estimate means on strands that were reconstructed, one sentence."""
+        return (
+            "Fibres inside a pixel vary more than the reconstructed strands: "
+            f"beta_m {self.beta_m:.2g} (95 % interval {self.low:.2g}–{self.high:.2g}) is the "
+            "roughness to render these strands with, and may exceed that of a single fibre by a "
+            "third (docs/appearance.md)."
+        )
+
     def warnings(self) -> list[str]:
-        """What a user has to know before believing it, a sentence each."""
-        said, either = [], f"{self.low:.2g} to {self.high:.2g}"
-        (least, most), d = self.range, self.disorder
-        unsure = d is not None and not d.told and self.low < SURE * self.beta_m
+        """What makes the estimate uncertain, one sentence each."""
+        interval = f"95 % interval {self.low:.2g}–{self.high:.2g}"
+        (least, most), out = self.range, []
         if any(self.ends()):
-            said.append(
-                f"β_M {self.beta_m:.2g} is known to lie in {either} only, which reaches an end of "
-                f"the range that was rendered, {least:.2g} to {most:.2g}"
+            out.append(
+                f"beta_m {self.beta_m:.2g} ({interval}) reaches an end of the rendered range, "
+                f"{least:.2g}–{most:.2g}: the true roughness may lie outside."
             )
-        elif self.high > WIDEST * self.low and not unsure:
-            said.append(f"β_M {self.beta_m:.2g} is uncertain: the highlight fits {either}")
-        if np.sqrt(self.error**2 - self.systematic**2) > max(2 * self.parts, LARGEST_ERROR):
+        elif self.high > WIDEST * self.low:
+            out.append(f"beta_m {self.beta_m:.2g} is uncertain: {interval}.")
+        if self.error > max(2 * self.parts, LARGEST_ERROR):
             views = ", ".join(f"{beta:.2g}" for beta in self.views)
-            said.append(f"views disagree about β_M by more than their noise: {views}")
-        turns = "single hairs turn more than the strands"
-        if d is not None and d.told:
-            said.append(
-                f"{turns}, by {d.low:.0f} to {d.high:.0f}°, by what pixels beside each other tell: "
-                f"the fibres' β_M, {self.beta_m:.2g} ({either}), stands on that"
-            )
-        elif d is not None and unsure:
-            said.append(
-                f"pixels beside each other hardly tell by how much {turns}, {d.low:.0f} to "
-                f"{d.high:.0f}°: the fibres' β_M, {self.beta_m:.2g}, may be {either}"
-            )
-        if d is not None and d.beyond:
-            said.append(
-                "pixels beside each other differ by more than strands turned by "
-                f"{d.most:g}° do, the most that are told apart: β_M {self.beta_m:.2g} is uncertain"
-            )
+            out.append(f"Cameras disagree about beta_m by more than their noise: {views}.")
         if self.misfit > WORST_MISFIT:
-            said.append(
-                f"no roughness fits the highlight (χ² {self.misfit:.1f} per degree of freedom): "
-                "are the strands where the hair is?"
+            out.append(
+                f"No roughness reproduces the highlight (χ² {self.misfit:.1f} per degree of "
+                "freedom): check that the strands lie where the hair is."
             )
-        return said
+        return out
 
 
 def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlight]]) -> Roughness:

@@ -94,34 +94,6 @@ def mirror_samples(
     )
 
 
-def answers(observed: Observed, fibres: VisibleFibres, channel: int, at: Ints) -> Array:
-    """Radiance over the light's irradiance across the ray, 1/sr, at the flat `at (N,)` in `(L, P)`.
-
-    Lights shine there.
-    """
-    light, pixel = np.divmod(at, max(observed.valid.shape[1], 1))
-    middle = _middle(fibres)
-    away = _positions(observed)[light] - middle[pixel]
-    shines = [x.intensity_towards(middle)[:, channel] for x in observed.lights]
-    irradiance = np.reshape(shines, observed.valid.shape)[light, pixel] / (away**2).sum(axis=1)
-    return np.asarray(observed.radiance[light, pixel, channel] / irradiance)
-
-
-def lobes(observed: Observed, fibres: VisibleFibres, v: float, tilt_deg: float, at: Ints) -> Array:
-    """Mean lobes of variance `v` over either half of a pixel's rays `(2, N)`.
-
-    `at (N,)` are pairs of a light and a pixel, flat in `(L, P)`.
-    """
-    light, pixel = np.divmod(at, max(observed.valid.shape[1], 1))
-    middle = _middle(fibres)
-    to_camera = _unit(observed.camera.center - middle)
-    theta_o = _angle(np.einsum("pi,pki->pk", to_camera, fibres.tangent)) + 2 * np.radians(tilt_deg)
-    towards = _unit(_positions(observed)[light] - middle[pixel])
-    theta_i = _angle(np.einsum("ni,nki->nk", towards, fibres.tangent[pixel]))
-    each = longitudinal(theta_i, theta_o[pixel], v) * fibres.hair[pixel]
-    return np.stack([each[:, ::2].mean(axis=1), each[:, 1::2].mean(axis=1)])
-
-
 def mirror_lights(
     observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, window: float = WINDOW
 ) -> Ints:
@@ -188,15 +160,14 @@ def near_mirror(
     fibres: VisibleFibres,
     tilt_deg: float,
     window: float = WINDOW,
-    along: Array | None = None,
 ) -> NearMirror:
     """Samples with |θ_i + θ_o + 2 tilt| below `window` and |φ_i − φ_o| below π/6.
 
-    The fibres run along the mean tangent of each pixel, or `along (P, 3)`. Pixels that are not
-    `usable` are left out, and lights where they send under `LEAST_LIT` of their most.
+    The fibres run along the mean tangent of each pixel. Pixels that are not `usable` are left out,
+    and lights where they send under `LEAST_LIT` of their most.
     """
     middle = _middle(fibres)
-    mean = fibres.mean_tangent() if along is None else along
+    mean = fibres.mean_tangent()
     to_camera = _unit(observed.camera.center - middle)
     towards = _positions(observed)[:, None] - middle
     squared = (towards**2).sum(axis=-1)

@@ -66,10 +66,8 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
 
     Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
     (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells. Sun's fit has
-    what it found of the fibres themselves, whatever strands stand for them (`fibre_beta_m`, its
-    `fibre_beta_m_range`, and `disorder_deg`), and the standard errors of logarithms:
-    `fibre_beta_m_error`, and `sigma_a_error (3,)`, where None stands for what the colour does not
-    tell. `true` has one roughness, as `beta_m` and as `fibre_beta_m`.
+    the 95 % interval of its roughness, `beta_m_interval`, and standard errors of logarithms,
+    `beta_m_error` and `sigma_a_error (3,)`, None in a channel whose colour does not determine it.
     Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
     at Sun's value: the same absorption means another colour under another beta_n.
     """
@@ -91,14 +89,9 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
 
     sun, true = FittedAppearance.load(model), json.loads(truth.read_text())
     out = {"fitted": figures(HairMaps.of(sun.hair), sun.skin)}
-    if (known := sun.fibres) is not None:
-        out["fitted"] |= {
-            "fibre_beta_m": known.beta_m,
-            "fibre_beta_m_error": known.error,
-            "fibre_beta_m_range": [known.low, known.high],
-        }
-        if known.disorder_deg is not None:
-            out["fitted"]["disorder_deg"] = known.disorder_deg
+    if sun.beta_m_interval is not None:
+        out["fitted"]["beta_m_error"] = sun.beta_m_error
+        out["fitted"]["beta_m_interval"] = list(sun.beta_m_interval)
     if sun.sigma_a_error is not None:
         out["fitted"]["sigma_a_error"] = list(sun.sigma_a_error)
     for folder in (model, model.rejected()):
@@ -108,5 +101,4 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
             out["inverse_rendering"] = figures(maps, sun.skin)
             out["fitted"] = out["inverse_rendering" if folder is model else "sun_fit"]
     out["true"] = figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"])
-    out["true"]["fibre_beta_m"] = out["true"]["beta_m"]
     return out

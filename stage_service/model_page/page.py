@@ -178,19 +178,12 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
     if not model.has("appearance.json"):
         return
     fit = model.json("appearance.json")
-    hair, fibres, errors = fit["hair"], fit.get("fibres"), fit.get("sigma_a_error")
+    hair, interval, errors = fit["hair"], fit.get("beta_m_interval"), fit.get("sigma_a_error")
     known = errors is not None
     said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}"), ", to render these strands with"]
+    if interval:
+        said.append(f"; 95 % interval {interval[0]:.2f} to {interval[1]:.2f}")
     yield "roughness", said
-    if fibres:
-        said = [element("b", f"β_M {fibres['beta_m']:.2f}")]
-        said.append(f", {fibres['low']:.2f} to {fibres['high']:.2f} at about 95 %")
-        if fibres.get("disorder_low_deg") is not None:
-            turns = "{disorder_low_deg:.0f} to {disorder_high_deg:.0f}°".format(**fibres)
-            said.append(f"; single hairs turn by {turns} more than these strands")
-    else:
-        said = ["not known"]
-    yield "of the fibres", said
     said = [_swatch(fit["colour"]), "σ_a "]
     for k, (value, error) in enumerate(zip(hair["sigma_a"], errors or [None] * 3, strict=True)):
         said += [", " if k else "", element("b", f"{value:.2g}")]

@@ -61,9 +61,8 @@ def model(tmp_path):
         stage.warn("look here: " + EVIL)
     model.write_report(report)
     hair = {"sigma_a": [0.1, 0.2, 0.4], "beta_m": 0.33, "beta_n": 0.2}
-    fibres = {"beta_m": 0.3, "low": 0.28, "high": 0.39, "disorder_deg": 14.2}
-    fibres |= {"disorder_low_deg": 11.8, "disorder_high_deg": 16.4}
-    fit = {"hair": hair, "colour": [1.0, 0.5, 0.0], "skin": [0.2, 0.2, 0.2], "fibres": fibres}
+    fit = {"hair": hair, "colour": [1.0, 0.5, 0.0], "skin": [0.2, 0.2, 0.2]}
+    fit["beta_m_interval"] = [0.28, 0.39]
     fit["sigma_a_error"] = [0.05, 0.06, None]
     model.write_json("appearance.json", fit)
     model.write_png("relit.png", np.zeros((2, 2, 3), np.uint8))
@@ -84,7 +83,7 @@ def test_everything_that_is_known_stands_on_the_page(model):
     text = Page(model_page(model)).text
     for said in (
         *("2 of 4 points", "0 m in all; a strand 100 mm, median", "50 µm"),
-        *("β_M 0.33", "β_M 0.30, 0.28 to 0.39 at about 95 %; single hairs turn by 12 to 16° more"),
+        "β_M 0.33, to render these strands with; 95 % interval 0.28 to 0.39",
         *("σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
         *("growth of strands look here", "voxels", "no hair", "3 of 4"),
         *("off mm0.5 (0.25 to 1.5: 10 to 90 %)", "50.0 / 25.0 / 33.3", "hull + vertical"),

@@ -47,8 +47,8 @@ def figures_table(results: Mapping[str, Any], out: Path) -> Group:
     hair = Table("appearance", *(PICTURES.get(name, name) for name in fits))
     for key, what in _APPEARANCE.items():
         hair.add_row(what, *(_numbers(figures[key]) for figures in fits.values()))
-    if any("fibre_beta_m" in figures for figures in fits.values()):
-        hair.add_row("β_M of the fibres", *map(_fibres, fits.values()))
+    if any("beta_m_interval" in figures for figures in fits.values()):
+        hair.add_row("its 95 % interval", *(_interval(f) for f in fits.values()))
     if any("sigma_a_error" in figures for figures in fits.values()):
         errors = (_per_cent(figures.get("sigma_a_error")) for figures in fits.values())
         hair.add_row("standard error of σ_a", *errors)
@@ -156,12 +156,9 @@ def _rows(short: bool = False) -> dict[str, list[_Part]]:
             decibels, ssim = (partial(_score, group=group, name=name, score=s) for s in _SCORES)
             where = group.replace("held_out_", "held-out ")
             rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]
-    rows["β_M of the fibres: ours"] = [(partial(_fibre, key="fibre_beta_m"), ".2f", "")]
-    rows["β_M of the fibres: standard error"] = [(_fibre_error, ".2f", "")]
-    rows["β_M of the fibres: the truth"] = [(partial(_beta_m, fit="true"), ".2f", "")]
     rows["β_M to render these strands with"] = [(partial(_beta_m, fit="fitted"), ".2f", "")]
-    turns = partial(_fibre, key="disorder_deg")
-    rows["turns of single hairs beyond our strands"] = [(turns, ".0f", "°")]
+    rows["β_M of Sun's fit: standard error"] = [(_beta_m_error, ".2f", "")]
+    rows["β_M of the true fibres"] = [(partial(_beta_m, fit="true"), ".2f", "")]
     rows["σ_a, the channel that is furthest off"] = [(_absorption_error, ".0f", " %")]
     return rows
 
@@ -201,16 +198,11 @@ def _beta_m(results: Mapping[str, Any], fit: str) -> float | None:
     return None if found is None else float(found["beta_m"])
 
 
-def _fibre(results: Mapping[str, Any], key: str) -> float | None:
-    """What Sun's fit found of the fibres; None in results of an earlier version."""
+def _beta_m_error(results: Mapping[str, Any]) -> float | None:
+    """Standard error of the roughness of Sun's fit; None in results without one."""
     fits = results["appearance"]
-    found: float | None = fits.get("sun_fit", fits["fitted"]).get(key)
-    return found
-
-
-def _fibre_error(results: Mapping[str, Any]) -> float | None:
-    value, error = (_fibre(results, key) for key in ("fibre_beta_m", "fibre_beta_m_error"))
-    return None if value is None or error is None else value * error
+    sun = fits.get("sun_fit", fits["fitted"])
+    return sun["beta_m"] * sun["beta_m_error"] if "beta_m_error" in sun else None
 
 
 def _absorption_error(results: Mapping[str, Any]) -> float | None:
@@ -232,9 +224,9 @@ def _numbers(value: Any) -> str:
     return ", ".join(f"{x:.3g}" for x in values)
 
 
-def _fibres(figures: Mapping[str, Any]) -> str:
-    value, ends = (figures.get(key) for key in ("fibre_beta_m", "fibre_beta_m_range"))
-    return _numbers(value or []) + ("" if ends is None else f" ({ends[0]:.3g} to {ends[1]:.3g})")
+def _interval(figures: Mapping[str, Any]) -> str:
+    ends = figures.get("beta_m_interval")
+    return "" if ends is None else f"{ends[0]:.3g} to {ends[1]:.3g}"
 
 
 def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Group:

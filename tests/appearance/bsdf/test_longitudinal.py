@@ -13,7 +13,6 @@ from appearance.bsdf.longitudinal import (
     log_longitudinal,
     longitudinal,
     roughness_of_variance,
-    roughness_without_scatter,
     variance_of_roughness,
 )
 
@@ -100,19 +99,3 @@ def test_colour_outside_its_range_is_clamped_with_a_warning():
     assert sigma[0] > 1.0
     with pytest.raises(ValueError, match="finite"):
         absorption_of_colour([np.nan], 0.2)
-
-
-def test_scatter_of_directions_is_taken_off_a_mixed_lobe():
-    """Fibres that each lean by another ε, seen as one: the lobe averaged over leans, integrated."""
-    scatter, theta = np.radians(5), np.linspace(-1.2, 1.2, 4001)
-    nodes, weights = np.polynomial.hermite_e.hermegauss(20)
-    lean = scatter * nodes[:, None]
-
-    def read(lobe):
-        return float(roughness_of_variance(lobe @ theta**2 / lobe.sum()))
-
-    one = read(longitudinal(0.0, theta, 0.02))
-    mixed = read(weights @ longitudinal(lean, theta + lean, 0.02))
-    assert mixed > 1.3 * one
-    assert roughness_without_scatter(mixed, scatter) == pytest.approx(one, rel=0.02)
-    assert roughness_without_scatter(one, 4 * scatter) is None

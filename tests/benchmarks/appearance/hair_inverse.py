@@ -39,7 +39,7 @@ def hair_inverse(
     fitting = SunFit(base, FitPixels(few, skin), options, seed, progress)
     try:
         found = fitting.roughness(stage)
-        beta_m = found.as_are.beta_m
+        beta_m = found.matched.beta_m
         start: Array | None = np.array(found.first.colour)
         albedo = np.array(found.first.skin)
     except ValueError as error:

@@ -10,7 +10,7 @@ import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut
 from appearance.bsdf.maps import HairMaps
-from appearance.sun_fit.fitted_appearance import Fibres, FittedAppearance
+from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Model
 from stage_service.jobs.evaluation import evaluate_appearance
 
@@ -39,17 +39,16 @@ def test_one_colour_under_two_azimuthal_roughnesses_is_one_colour(tmp_path):
     assert figures["true"]["v"] < figures["fitted"]["v"]
 
 
-def test_the_fibres_roughness_is_not_that_of_the_strands_that_stand_for_them(tmp_path):
+def test_the_spread_is_that_of_suns_fit_when_inverse_rendering_is_shown(tmp_path):
     hair = HairAppearance((0.1, 0.2, 0.4), 0.34, 0.2)
-    known = Fibres(0.3, 0.02, 0.27, 0.33, 14.0, 1.5)
-    fit = (hair, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2, HeldOut(), known)
-    FittedAppearance(*fit, (0.1, None, 0.2)).save(Model(tmp_path))
+    fit = (hair, (0.5,) * 3, (0.4, 0.3, 0.2), Exposure(1.0), 0.2, 0.2, 0.2, HeldOut())
+    FittedAppearance(*fit, 0.1, (0.3, 0.4), (0.1, None, 0.2)).save(Model(tmp_path))
     HairMaps.of(replace(hair, beta_m=0.4)).save(Model(tmp_path), np.zeros((1, 2)))
     truth = tmp_path / "truth.json"
     true = HairAppearance((0.1, 0.2, 0.4), 0.28, 0.2)
     truth.write_text(json.dumps({"hair": true.to_dict(), "skin": [0.5, 0.4, 0.3]}))
     figures = evaluate_appearance(Model(tmp_path), truth)
     assert [figures[fit]["beta_m"] for fit in ("fitted", "sun_fit", "true")] == [0.4, 0.34, 0.28]
-    assert [figures[fit]["fibre_beta_m"] for fit in ("sun_fit", "true")] == [0.3, 0.28]
-    assert figures["sun_fit"]["fibre_beta_m_range"] == [0.27, 0.33]
+    assert figures["sun_fit"]["beta_m_interval"] == [0.3, 0.4]
+    assert "beta_m_interval" not in figures["fitted"]
     assert figures["sun_fit"]["sigma_a_error"] == [0.1, None, 0.2]
