@@ -42,7 +42,6 @@ FILES = {
     "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
     "lights.json": "the lights as inverse rendering found them",
     "field.npz": "what the hair reflects beyond its material (hairstage fit --field)",
-    "rejected": "the same three files, where pictures are not clearly better with them",
     "samples": "captured frames by camera, for pictures that interpolate them",
     "comparison.png": "held-out frames, captured and rendered",
     "inverse_rendering.png": "held-out frames before and after inverse rendering, error maps",
@@ -65,7 +64,6 @@ _OF_APPEARANCE = (
     "hair_maps.npz",
     "lights.json",
     "field.npz",
-    "rejected",
     "comparison.png",
     "inverse_rendering.png",
     "relit.png",
@@ -119,16 +117,6 @@ class Model:
         """Remove every fit to the strands, and the pictures and figures of it."""
         for name in _OF_APPEARANCE:
             self.remove(name)
-
-    def rejected(self) -> Model:
-        """Where hair maps and lights lie that are not to be rendered: a folder like a model's."""
-        return Model(self.file("rejected"))
-
-    def reject(self, *names: str) -> None:
-        """Put files where nothing renders them: into `rejected`."""
-        folder = self.rejected().create()
-        for name in names:
-            self.file(name).replace(folder.file(name))
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:

@@ -11,7 +11,6 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from appearance.fields.anchors import Grid, Places, anchors_of
 from appearance.fields.hits import Hits
-from appearance.fields.turns import COUNT, turning_features
 from appearance.render.harmonics import harmonics, turns
 from reconstruction.arrays import Floats, Ints
 
@@ -72,10 +71,6 @@ class ViewBasis:
             found = self.turned @ found.reshape(len(found) * n, -1)
         return np.asarray(found.reshape(-1, n, coefficients.shape[1] // n**2))
 
-    def shown(self, coefficients: Floats) -> Floats:
-        """The same."""
-        return self.at_pixels(coefficients)
-
     def at_anchors(self, values: Floats) -> Floats:
         """The transpose: `values (P, n, c)` gathered at the anchors `(M, v · n · c)`."""
         n = self.harmonics
@@ -100,51 +95,6 @@ class ViewBasis:
             squared.data *= np.float32(len(flat) / max(len(values), 1))
         n = self.harmonics
         return np.asarray((squared.T @ flat).reshape(-1, n * n * values.shape[2]))
-
-
-@dataclass(frozen=True, eq=False)
-class TurningBasis:
-    """What P pixels of one camera show of a field of turns: a linear map of its coefficients.
-
-    Coefficients `(M, K · c)` are K for each of M anchors and c columns, the result `(P, K, c)`
-    their means over a pixel's hits by `anchors (P, M)`; `features (P, K, n)` are what they
-    multiply.
-    """
-
-    anchors: Any
-    features: Floats
-
-    @classmethod
-    def of(cls, hits: Hits, grid: Grid, places: Places, beta_m: float) -> TurningBasis:
-        """The map of the `hits` for anchors of `grid`."""
-        number, low, high, share = anchors_of(hits, grid, places)
-        weight, pixel = hits.column("weight").ravel()[number], number // hits.count
-        values = np.concatenate([weight * (1 - share), weight * share])
-        at = np.concatenate([pixel, pixel]), np.concatenate([low, high])
-        anchors: Any = csr_matrix((values, at), shape=(len(hits.pixels), grid.count))
-        return cls(anchors, turning_features(hits, beta_m))
-
-    @property
-    def harmonics(self) -> int:
-        """K."""
-        return COUNT
-
-    def at_pixels(self, coefficients: Floats) -> Floats:
-        """`coefficients (M, K · c)` at the pixels `(P, K, c)`."""
-        found = self.anchors @ coefficients
-        return np.asarray(found.reshape(len(found), COUNT, -1))
-
-    def at_anchors(self, values: Floats) -> Floats:
-        """The transpose: `values (P, K, c)` gathered at the anchors `(M, K · c)`."""
-        return np.asarray(self.anchors.T @ values.reshape(len(values), -1))
-
-    def squares(self, values: Floats) -> Floats:
-        """The diagonal `(M, K · c)` at the anchors of one at the pixels, `values (P, K, c)`."""
-        return np.asarray(self.anchors.power(2).T @ values.reshape(len(values), -1))
-
-    def shown(self, coefficients: Floats) -> Floats:
-        """`coefficients (M, K · c)` as harmonics of the direction to the light `(P, n, c)`."""
-        return np.matmul(self.features.transpose(0, 2, 1), self.at_pixels(coefficients))
 
 
 def _turning(blocks: Sequence[Floats], pixel: Ints, pixels: int) -> Any:

@@ -13,7 +13,6 @@ from appearance.fields.anchors import Grid, Places
 from appearance.fields.form import Form
 from appearance.fields.hits import HitOptions, Hits, find_hits
 from appearance.fields.options import Kind
-from appearance.fields.turns import DEGREE
 from appearance.render.harmonics import count_of
 from appearance.render.pixel_field import PixelField
 from appearance.scene.hair_scene import HairScene
@@ -32,8 +31,7 @@ class Field:
     """Harmonics at the anchors of a grid; `places` find them from the strands.
 
     `values (M, v · n · 3)` are those of the anchors with numbers `rows (M,)`, 0 at all others; v
-    harmonics of the direction to the camera, n = v of that to the light, up to `degree`. A field of
-    turns has `(M, 3 · 3)`: a factor and two turns of lobes of the roughness `beta_m`.
+    harmonics of the direction to the camera, n = v of that to the light, up to `degree`.
     """
 
     kind: Kind
@@ -42,19 +40,18 @@ class Field:
     places: Places
     rows: Ints
     values: Floats
-    beta_m: float = 0.0
 
     @classmethod
     def of(cls, form: Form, grid: Grid, places: Places, coefficients: Floats) -> Field:
         """The field of `coefficients` at all anchors `(grid.count, Q · 3)`."""
         rows = np.flatnonzero(coefficients.any(axis=1))
         values = coefficients[rows]
-        return cls(form.kind, form.degree, grid, places, rows, values, form.beta_m)
+        return cls(form.kind, form.degree, grid, places, rows, values)
 
     @property
     def form(self) -> Form:
         """What its values are of."""
-        return Form(self.kind, self.degree, self.beta_m)
+        return Form(self.kind, self.degree)
 
     def on_cut(self, share: Array) -> Field:
         """The field on strands of which only `share (S,)` of the length is left, from the root."""
@@ -78,9 +75,9 @@ class Field:
         for start in range(0, len(hits.pixels), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
             few = replace(hits, pixels=hits.pixels[part], table=hits.table[part])
-            parts.append(self.form.basis(few, self.grid, self.places).shown(full))
+            parts.append(self.form.basis(few, self.grid, self.places).at_pixels(full))
         found = np.concatenate(parts) if parts else np.zeros((0, count_of(self.degree), 3))
-        additive = self.kind not in ("turns", "modulation")
+        additive = self.kind != "modulation"
         return PixelField(
             found.astype(np.float32), hits.middle(), additive, alone=self.kind == "whole"
         )
@@ -94,7 +91,6 @@ class Field:
             {
                 "kind": np.array(self.kind),
                 "degree": np.array(self.degree),
-                "beta_m": np.array(self.beta_m),
                 "grid": np.array(shape, np.int64),
                 "root_uv": self.places.root_uv.astype(np.float32),
                 "kept": self.places.kept.astype(np.float32),
@@ -113,10 +109,7 @@ class Field:
             kind, degree = kinds.get(str(data["kind"])), int(data["degree"])
             grid = Grid(*(int(n) for n in data["grid"]))
             rows, values = data["rows"].astype(np.int64), data["values"].astype(np.float32)
-            beta_m = float(data["beta_m"]) if "beta_m" in data else 0.0
-            if kind == "turns" and not (0 < beta_m <= 1 and degree == DEGREE):
-                raise ValueError(f"turns of beta_m {beta_m}, degree {degree}")
-            form = Form(kind or "modulation", degree, beta_m)
+            form = Form(kind or "modulation", degree)
             if kind is None or values.shape != (len(rows), form.count * 3):
                 raise ValueError(f"kind {data['kind']}, degree {degree}, values {values.shape}")
             if len(rows) and (rows.min() < 0 or rows.max() >= grid.count):
@@ -128,7 +121,7 @@ class Field:
         except (KeyError, TypeError, ValueError) as error:
             path = model.file(FIELD_FILE)
             raise ModelError(f"{path}: {error}: run 'hairstage fit --field' again") from error
-        return cls(kind, degree, grid, places, rows, values, beta_m)
+        return cls(kind, degree, grid, places, rows, values)
 
 
 @dataclass(frozen=True, eq=False)

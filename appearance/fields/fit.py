@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from appearance.fields.anchors import Grid, Places, nested
-from appearance.fields.basis import TurningBasis
+from appearance.fields.basis import ViewBasis
 from appearance.fields.field import Field
-from appearance.fields.form import Basis, Form
-from appearance.fields.grams import Gram, Samples
+from appearance.fields.form import Form
+from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures, irradiance
 from appearance.fields.solver import ignore
@@ -114,9 +114,9 @@ class _Fit:
         monitor: Monitor,
     ) -> None:
         self.options, self.monitor, self.places = options, monitor, places
-        self.form = Form.of(options)
+        self.form = Form(options.kind, options.degree)
         strands = len(places.fitted)
-        grids = [Grid.of(level, strands) for level in options.grids]
+        grids = [Grid.of(level, strands) for level in options.levels]
         self.grid = grids[-1]
         self.folds = Folds.of(len(views), len(views[0].lights), options.folds)
         unit = _unit(views) if not options.multiplies else 1.0
@@ -128,7 +128,7 @@ class _Fit:
             bases.append(self._basis(view))
             few = view.some(JUDGED)
             judges.append((few, bases[-1] if few is view else self._basis(few)))
-            samples = _featured(view.samples(options, scale, unit), bases[-1])
+            samples = view.samples(options, scale, unit)
             grams.append(
                 {
                     part: Gram.of(samples.under(self.folds.lights_of(part)), self.form.degree)
@@ -138,14 +138,15 @@ class _Fit:
         self.data = Data(views, bases, grams, judges, nested(grids, places), options, scale, unit)
         self.warnings: list[str] = []
 
-    def _basis(self, view: Pictures) -> Basis:
+    def _basis(self, view: Pictures) -> ViewBasis:
         return self.form.basis(view.hits, self.grid, self.places)
 
     def run(self) -> FieldFit:
         progress, options = self.monitor.progress, self.options
         ridges = sorted(options.ridges, reverse=True)
         if self.folds.count:
-            found = self._validated()
+            validating = part_of(progress, 0.3, 0.9)
+            found = cross_validated(self.data, self.folds, self.monitor.checkpoint, validating)
             if found.best == len(ridges) - 1:
                 self.warnings.append(
                     f"the weakest ridge of those allowed, {found.ridge:g}, is best"
@@ -167,22 +168,6 @@ class _Fit:
         scores = found.validation, found.gain, found.tried
         return FieldFit(made, found.ridge, *scores, clamped, self.warnings)
 
-    def _validated(self) -> Verdict:
-        """The verdict on the stiffness that left-out pictures prefer, which `data` has then."""
-        each = self.options.stiffness if self.options.kind == "turns" else (1.0,)
-        found: list[tuple[Verdict, Data]] = []
-        for k, stiffness in enumerate(each):
-            data = replace(self.data, stiffness=stiffness)
-            checkpoint = self.monitor.checkpoint
-            if checkpoint is not None and k:
-                checkpoint = checkpoint.with_name(f"{k}-{checkpoint.name}")
-            first, last = (0.3 + 0.6 * i / len(each) for i in (k, k + 1))
-            tell = part_of(self.monitor.progress, first, last)
-            verdict = cross_validated(data, self.folds, checkpoint, tell)
-            found.append((verdict, data))
-        best, self.data = max(found, key=lambda one: one[0].gain[0])
-        return best
-
     def _final(self, ridge: float, start: Floats | None) -> tuple[Floats, float]:
         """The field of all pictures `(M, Q · 3)`, and the share of samples that it clamps."""
         data, options = self.data, self.options
@@ -197,8 +182,8 @@ class _Fit:
             if clamped <= MOST_CLAMPED or round_ == _CLAMP_ROUNDS:
                 break
             grams = []
-            for view, basis, where in zip(data.views, data.bases, below, strict=True):
-                samples = _featured(view.samples(options, data.scale), basis)
+            for view, where in zip(data.views, below, strict=True):
+                samples = view.samples(options, data.scale)
                 weight = np.where(where, 0, samples.weight)
                 grams.append({-1: Gram.of(replace(samples, weight=weight), self.form.degree)})
             data = replace(data, grams=grams)
@@ -208,11 +193,6 @@ class _Fit:
                 "rendering is far from these frames"
             )
         return fine, clamped
-
-
-def _featured(samples: Samples, basis: Basis) -> Samples:
-    """`samples` of what the basis multiplies by its coefficients."""
-    return replace(samples, features=basis.features) if isinstance(basis, TurningBasis) else samples
 
 
 def _unit(views: Sequence[Pictures]) -> float:
@@ -229,7 +209,7 @@ def _unit(views: Sequence[Pictures]) -> float:
 def _below(data: Data, number: int, fine: Floats) -> Bools:
     """Where the modulation is below 0 `(L, P, 3)`."""
     view = data.views[number]
-    g, points = data.bases[number].shown(fine), view.hits.middle()
+    g, points = data.bases[number].at_pixels(fine), view.hits.middle()
     out = np.zeros(view.captured.shape, bool)
     for i, light in enumerate(view.lights):
         y = harmonics(light.position - points, data.form.degree)

@@ -25,17 +25,10 @@ class Samples:
     regressors: Floats
     targets: Floats
     weight: Floats
-    features: Floats | None = None
 
     def directions(self, degree: int, light: int) -> Floats:
-        """The harmonics `(P, n)` of the directions from the points to a light by its number.
-
-        Where there are `features (P, K, n)`, sums of harmonics, what each of these is: `(P, K)`.
-        """
-        y = harmonics(self.lights[light].position - self.points, degree)
-        if self.features is None:
-            return y
-        return np.asarray(np.matmul(self.features, y[:, :, None])[:, :, 0])
+        """The harmonics `(P, n)` of the directions from the points to a light by its number."""
+        return harmonics(self.lights[light].position - self.points, degree)
 
     def under(self, lights: list[int]) -> Samples:
         """The same pixels under some of the lights, by their numbers."""
@@ -51,13 +44,12 @@ class Gram:
     """The weighted error of a view, as `Samples` has it, as a quadratic of its pixels' harmonics.
 
     For coefficients g `(P, n, 3)` it is the sum over pixels and channels of
-    g · `matrix` g − 2 `right` · g, and `constant`. `packed (P, 3, n(n + 1)/2)` holds the upper
+    g · `matrix` g − 2 `right` · g, and a constant. `packed (P, 3, n(n + 1)/2)` holds the upper
     triangles of the symmetric matrices, `right (P, n, 3)`.
     """
 
     packed: Floats
     right: Floats
-    constant: float
 
     @classmethod
     def of(cls, samples: Samples, degree: int) -> Gram:
@@ -70,8 +62,7 @@ class Gram:
         packed = np.matmul((w * x * other).transpose(1, 2, 0), both)
         across = np.float32(0.5) * w * (x * second + other * t)
         right = np.matmul(y.transpose(1, 2, 0), across.transpose(1, 0, 2))
-        constant = float((w * t * second).sum(dtype=np.float64))
-        return cls(packed, right, constant)
+        return cls(packed, right)
 
     def times(self, g: Floats) -> Floats:
         """The matrices times each of `g (P, n, 3, F)`."""
@@ -91,13 +82,3 @@ class Gram:
             of_degree = degrees == k
             out[:, of_degree] = out[:, of_degree].mean(axis=1, keepdims=True)
         return np.asarray(out)
-
-    def __add__(self, other: Gram) -> Gram:
-        """The quadratic of the same pixels under the lights of both."""
-        right, constant = self.right + other.right, self.constant + other.constant
-        return Gram(self.packed + other.packed, right, constant)
-
-    def error(self, g: Floats) -> float:
-        """The weighted squared error at `g (P, n, 3)`."""
-        change = np.sum(g * (self.times(g[..., None])[..., 0] - 2 * self.right), dtype=np.float64)
-        return self.constant + float(change)

@@ -8,9 +8,8 @@ from pydantic import AfterValidator, Field
 
 from reconstruction.options import Count, options
 
-Kind = Literal["turns", "modulation", "additive", "whole"]
-"""What a field is of: a factor on inverse rendering's light and turns of its fibres, harmonics of
-such a factor, of what is added to it, or of all light."""
+Kind = Literal["modulation", "additive", "whole"]
+"""What a field is of: a factor on inverse rendering's light, light added to it, or all light."""
 Degree = Annotated[int, Field(ge=0, le=3)]
 Positive = Annotated[float, Field(gt=0)]
 
@@ -28,17 +27,13 @@ Level = Annotated[
 
 RIDGES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
 NESTED: tuple[Level, ...] = ((2, 4, 4), (4, 12, 12), (8, 32, 32))
-OF_TURNS: tuple[Level, ...] = ((4, 4, 4), (8, 10, 10), (12, 24, 24))
 
 
 @options
 class FieldOptions:
     """How a field of reflectance is fitted.
 
-    `kind`: "turns" multiplies the light of inverse rendering by a factor of each place, and by what
-    two turns of the fibre do to lobes of the longitudinal roughness `beta_m` (a capture's fit takes
-    the model's), the ridge of the factor `stiffness` times that of turns, as left-out pictures
-    prefer; "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
+    `kind`: "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
     frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" is all of the
     light, without inverse rendering (GaussianHair's appearance, as GroomLight's supplement has it).
     `degree` of the harmonics of the direction to the camera and to the light. `levels`: grids of
@@ -50,37 +45,29 @@ class FieldOptions:
     """
 
     kind: Kind = "modulation"
-    beta_m: Annotated[float, Field(gt=0, le=1)] = 0.3
-    stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (10.0, 0.1)
     degree: Degree = 1
-    levels: Annotated[tuple[Level, ...], Field(min_length=1)] | None = None
+    levels: Annotated[tuple[Level, ...], Field(min_length=1)] = NESTED
     ridges: Annotated[tuple[Positive, ...], Field(min_length=1)] = RIDGES
     iterations: Count = 40
     tolerance: Annotated[float, Field(gt=0)] = 0.01
     folds: Annotated[int, Field(ge=2, le=16)] = 3
 
     @property
-    def grids(self) -> tuple[Level, ...]:
-        """`levels`, or what the kind has."""
-        return self.levels or (OF_TURNS if self.kind == "turns" else NESTED)
-
-    @property
     def multiplies(self) -> bool:
         """Whether the field is a factor on inverse rendering's light."""
-        return self.kind in ("turns", "modulation")
+        return self.kind == "modulation"
 
 
 @options
 class FieldRequest:
-    """What a job may ask for.
+    """The options of a job.
 
-    Of the training lights `lights` and of each camera's hair `pixels` are used, all where there are
-    fewer. `hits` rays a pixel say which strands it shows; pictures of inverse rendering have `spp`
-    paths a pixel of at most `max_depth` vertices. "none" fits no field, "best" turns and
-    a modulation, of which the one stays whose left-out pictures gain more.
+    At most `lights` of the training lights and `pixels` of each camera's hair are used. `hits` rays
+    a pixel find the strands that it shows; pictures of inverse rendering have `spp` paths a pixel
+    of at most `max_depth` vertices. "none" fits no field and removes an earlier one.
     """
 
-    field: Literal["none", "best", "turns", "modulation", "additive"] = "modulation"
+    field: Literal["none", "modulation", "additive"] = "modulation"
     lights: Count = 64
     pixels: Count = 20_000
     hits: Annotated[int, Field(ge=1, le=64)] = 8

@@ -15,9 +15,8 @@ from appearance.bsdf.maps import MappedStrands
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.fit import JUDGED, FieldFit, Monitor, fit_pictures
 from appearance.fields.hits import RECORD, HitOptions, find_hits
-from appearance.fields.options import FieldRequest, Kind
+from appearance.fields.options import FieldRequest
 from appearance.fields.pictures import Pictures
-from appearance.fields.turns import COUNT, DEGREE
 from appearance.fields.validation import BLOCK
 from appearance.observations import chosen, observe
 from appearance.render.harmonics import count_of
@@ -33,17 +32,16 @@ from reconstruction.report.report import free_memory
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """What inverse rendering has to show of a capture: a scene with its maps and no field.
+    """The material alone of a capture's model: a scene with its maps and no field.
 
     `lights` are those of the fit, as they were found; `mapped` the scene's strands; `scale` the
-    capture's exposure; `beta_m` the hair's longitudinal roughness.
+    capture's exposure.
     """
 
     mapped: MappedStrands
     scene: HairScene
     lights: tuple[Light, ...]
     scale: float
-    beta_m: float
 
 
 def fit_field(
@@ -61,10 +59,7 @@ def fit_field(
     memory is short.
     """
     if request.field == "none":
-        raise ValueError("no field was asked for")
-    kinds: tuple[Kind, ...] = ("turns", "modulation")
-    if request.field != "best":
-        kinds = (request.field,)
+        raise ValueError("the field 'none' cannot be fitted")
     rng, folder = np.random.default_rng(seed), model.work("field")
     pixels = {
         c.name: chosen(model.mask(c.name, "hair", training), request.pixels, rng)
@@ -89,18 +84,11 @@ def fit_field(
     for i, (name, index) in enumerate(pixels.items()):
         progress(f"{name}: rendering {len(rendered.lights)} lights", 0.7 * i / len(pixels))
         views.append(_pictures(training, rendered, (name, index), request, folder, seed))
-    places, fits = Places.of(rendered.mapped.root_uv), []
-    for k, kind in enumerate(kinds):
-        options = replace(request.fit, kind=kind, beta_m=rendered.beta_m)
-        first, last = (0.7 + 0.3 * i / len(kinds) for i in (k, k + 1))
-        monitor = Monitor(part_of(progress, first, last), folder / f"{kind}.checkpoint.npz")
-        fits.append(fit_pictures(views, places, rendered.scale, options, monitor))
-    return better(fits)
-
-
-def better(fits: Sequence[FieldFit]) -> FieldFit:
-    """The fit that gains most of those whose left-out pictures leave no doubt, or of all."""
-    return max(fits, key=lambda found: (not found.doubts(), found.gain[0]))
+    options = replace(request.fit, kind=request.field)
+    checkpoint = folder / f"{request.field}.checkpoint.npz"
+    monitor = Monitor(part_of(progress, 0.7, 1.0), checkpoint)
+    places = Places.of(rendered.mapped.root_uv)
+    return fit_pictures(views, places, rendered.scale, options, monitor)
 
 
 def _pictures(
@@ -149,25 +137,12 @@ def _materials(scene: HairScene) -> Sequence[Any]:
 
 def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
     """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
-    if request.field == "best":
-        each = replace(request, field="turns"), replace(request, field="modulation")
-        return max(memory_needed(pixels, lights, strands, one) for one in each)
-    folds = request.fit.folds
-    kind: Kind = "turns" if request.field == "turns" else "modulation"
-    levels = replace(request.fit, kind=kind).grids
-    if kind == "turns":
-        n, per_anchor = COUNT, COUNT
-        hit = RECORD.itemsize + 4 * 8
-        own = 4 * COUNT * count_of(DEGREE)
-    else:
-        n = count_of(request.fit.degree)
-        per_anchor = n**2
-        turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
-        hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8
-        own = 0
-    pixel = request.hits * hit + own + folds * 3 * 4 * (n * (n + 1) // 2 + n) + 12 * 3 * lights
+    folds, n = request.fit.folds, count_of(request.fit.degree)
+    turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
+    hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8
+    pixel = request.hits * hit + folds * 3 * 4 * (n * (n + 1) // 2 + n) + 12 * 3 * lights
     judging = sum(min(p, JUDGED) for p in pixels) * 12 * 3 * lights
-    coefficients = 4 * per_anchor * 3 * sum(Grid.of(x, strands).count for x in levels)
+    coefficients = 4 * n**2 * 3 * sum(Grid.of(x, strands).count for x in request.fit.levels)
     at_once = min(max(1, BLOCK // coefficients), folds**2)
     view = max(pixels) * max(
         (3 * 8 * 8 + 4 * n * (n + 1) // 2) * lights, 2 * request.hits * n * 3 * 4 * at_once

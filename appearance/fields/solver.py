@@ -1,4 +1,4 @@
-"""Least squares of a field: conjugate gradients, and Adam on single pictures as the reference."""
+"""Least squares of a field by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from appearance.fields.form import Basis, Form
-from appearance.fields.grams import Gram, Samples
+from appearance.fields.basis import ViewBasis
+from appearance.fields.form import Form
+from appearance.fields.grams import Gram
+from appearance.render.harmonics import degrees
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats
 
 Iteration = Callable[[int, Floats, float], None]
@@ -27,7 +29,7 @@ class Seen:
     Its pictures may be in parts, `grams`, of which each belongs to the fits with numbers in `fits`.
     """
 
-    basis: Basis
+    basis: ViewBasis
     grams: Sequence[Gram]
     fits: Sequence[tuple[int, ...]] = ((0,),)
 
@@ -96,19 +98,12 @@ class LeastSquares:
     def diagonal(self) -> Floats:
         """About the diagonal `(N, Q · 3 · F)` of the left side."""
         if "diagonal" not in self.known:
-            k = self.form.alike
+            k = degrees(self.form.degree)
             pixels = [s.summed(lambda gram, _: gram.diagonal(k)[..., None]) for s in self.views]
             squared = self.nested.copy()
             squared.data = squared.data**2
             self.known["diagonal"] = squared.T @ self._at_anchors(_squared, pixels)
         return np.asarray(self.known["diagonal"] + self.penalty)
-
-    def objective(self, coefficients: Floats) -> float:
-        """What is minimised over `coefficients (N, Q · 3)` of one fit: its error, the ridge's
-        part."""
-        ridge = np.sum(self.penalty * coefficients**2, dtype=np.float64)
-        pixels = zip(self.views, self._pixels(self.nested @ coefficients), strict=True)
-        return float(ridge) + sum(gram.error(g) for seen, g in pixels for gram in seen.grams)
 
     def each(self, values: AnyFloats) -> Array:
         """The sums `(F,)` of `values (N, Q · 3 · F)` over all that belongs to a fit."""
@@ -130,7 +125,7 @@ class LeastSquares:
             yield seen.basis.at_pixels(parts[used])
 
     def _at_anchors(
-        self, gather: Callable[[Basis, Floats], Floats], pixels: Iterable[Floats]
+        self, gather: Callable[[ViewBasis, Floats], Floats], pixels: Iterable[Floats]
     ) -> Floats:
         """What views have at their pixels, summed up at the finest anchors `(M, Q · 3 · F)`."""
         parts: dict[tuple[int, ...], Floats] = {}
@@ -150,11 +145,11 @@ class LeastSquares:
         return total
 
 
-def _anchors(basis: Basis, values: Floats) -> Floats:
+def _anchors(basis: ViewBasis, values: Floats) -> Floats:
     return basis.at_anchors(values)
 
 
-def _squared(basis: Basis, values: Floats) -> Floats:
+def _squared(basis: ViewBasis, values: Floats) -> Floats:
     return basis.squares(values)
 
 
@@ -206,44 +201,4 @@ def conjugate_gradients(
         direction = z + system.spread(along) * direction
         left = np.divide(size, at_zero, out=np.zeros_like(size), where=at_zero > 0)
         on_iteration(k + 1, x, float(np.sqrt(left.max())))
-    return x
-
-
-@dataclass(frozen=True)
-class AdamOptions:
-    """`steps` of one picture each, at a learning `rate`; `seed` draws the pictures."""
-
-    rate: float
-    steps: int
-    seed: int = 0
-
-
-def adam(
-    system: LeastSquares,
-    samples: Sequence[Samples],
-    options: AdamOptions,
-    on_iteration: Iteration = ignore,
-) -> Floats:
-    """The reference: Adam (Kingma & Ba 2015), a random view under a random light a step.
-
-    `samples` are those of the views of `system`, whose minimum `(N, Q · 3)` is looked for.
-    """
-    rng = np.random.default_rng(options.seed)
-    x, first, second = (np.zeros(system.shape, np.float32) for _ in range(3))
-    pictures = [(v, k) for v, s in enumerate(samples) for k in range(len(s.lights))]
-    for k in range(1, options.steps + 1):
-        view, light = pictures[rng.integers(len(pictures))]
-        seen, picture = system.views[view], samples[view]
-        y = picture.directions(system.form.degree, light)
-        g = seen.basis.at_pixels(system.nested @ x)
-        answer = np.einsum("pn,pnc->pc", y, g)
-        (x1, x2), (t1, t2) = picture.regressors[:, light], picture.targets[:, light]
-        off = picture.weight[light] * (x1 * x2 * answer - np.float32(0.5) * (x1 * t2 + x2 * t1))
-        pulled = seen.basis.at_anchors(y[:, :, None] * off[:, None])
-        slope = len(pictures) * (system.nested.T @ pulled) + system.penalty * x
-        first += np.float32(0.1) * (slope - first)
-        second += np.float32(0.001) * (slope * slope - second)
-        ahead, size = first / (1 - 0.9**k), second / (1 - 0.999**k)
-        x -= np.float32(options.rate) * ahead / (np.sqrt(size) + np.float32(1e-8))
-        on_iteration(k, x, float("nan"))
     return x

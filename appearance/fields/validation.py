@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from appearance.fields.form import Basis, Form
+from appearance.fields.basis import ViewBasis
+from appearance.fields.form import Form
 from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
@@ -88,14 +89,13 @@ class Data:
     """
 
     views: Sequence[Pictures]
-    bases: Sequence[Basis]
+    bases: Sequence[ViewBasis]
     grams: Sequence[dict[int, Gram]]
-    judges: Sequence[tuple[Pictures, Basis]]
+    judges: Sequence[tuple[Pictures, ViewBasis]]
     nested: Any
     options: FieldOptions
     scale: float
     unit: float
-    stiffness: float = 1.0
 
     def system(self, ridge: float, without: tuple[Folds, range] | None = None) -> LeastSquares:
         """The fit to everything, or at once the fits to what each of some folds leaves."""
@@ -117,7 +117,7 @@ class Data:
     @property
     def form(self) -> Form:
         """What the coefficients are of."""
-        return replace(Form.of(self.options), stiffness=self.stiffness)
+        return Form(self.options.kind, self.options.degree)
 
     def blocks(self, folds: Folds) -> list[range]:
         """The folds in blocks that are solved at once: as many as `BLOCK` bytes hold."""
@@ -133,13 +133,13 @@ class Data:
     def judging(self, view: int, fine: Floats) -> PixelField:
         """The fields of `fine (M, Q · 3 · F)` at the pixels that judge a view."""
         pictures, basis = self.judges[view]
-        found = (self.unit * basis.shown(fine)).astype(np.float32)
+        found = (self.unit * basis.at_pixels(fine)).astype(np.float32)
         additive, alone = not self.options.multiplies, self.options.kind == "whole"
         return PixelField(found, pictures.hits.middle(), additive, alone=alone)
 
     def fingerprint(self) -> str:
         """Of all that a fit depends on."""
-        total = hashlib.sha256(repr((self.options, self.scale, self.stiffness)).encode())
+        total = hashlib.sha256(repr((self.options, self.scale)).encode())
         for gram in (g for parts in self.grams for g in parts.values()):
             total.update(np.ascontiguousarray(gram.right).tobytes())
         return total.hexdigest()

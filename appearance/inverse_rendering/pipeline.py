@@ -55,9 +55,9 @@ def fit_maps(
     The head is the model's. Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` where
     images are held out (captured, rendered and error maps) and the stage "inverse_rendering" of
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
-    the fit is done, and so do an earlier fit and the field on top of it. Where whole training
-    pictures are not clearly better with what was found than with Sun's fit, it goes to the model's
-    folder "rejected", with a warning. Returns `{"ended", "steps", "error", "start_error", "sure",
+    the fit is done, and so do an earlier fit and the field on top of it. If full training images
+    are not clearly better with the result than with Sun's fit, it is discarded with a warning.
+    Returns `{"ended", "steps", "error", "start_error", "sure",
     "accepted", "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
     "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
     fit and of what was found; "doubts" are warnings for whoever renders what was found. Raises
@@ -116,12 +116,11 @@ def fit_maps(
             judging = Sampling(request.judged_spp, depth, seed)
             result["held_out"] = judge(model, frames, fits, fitted.exposure, judging)
             result |= scores_unavailable()
-        for place in (model, model.rejected()):
-            for earlier in ("field.npz", *FILES):  # a field belonged to the maps below it
-                place.remove(earlier)
-        place = model if taken else model.rejected().create()
-        for name in FILES:
-            judged.file(name).replace(place.file(name))
+        for earlier in ("field.npz", *FILES):  # a field belonged to the maps below it
+            model.remove(earlier)
+        if taken:
+            for name in FILES:
+                judged.file(name).replace(model.file(name))
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     report.drop("field")
     model.write_report(report)

@@ -181,8 +181,7 @@ class _Comparison:
             if images
         }
         judge(result, stage)
-        if both:
-            result["rendered"] = rendered
+        result["rendered"] = rendered
         stage.figures |= {**result, "diffuse_albedo": list(albedo), **scores_unavailable()}
         shown = "ours" in lit  # by itself, beside what it is made of
         others = [name for name in lit if name in FITS[1:] and (shown or name != rendered)]

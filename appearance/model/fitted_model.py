@@ -56,7 +56,7 @@ class FittedModel:
     ) -> FittedModel:
         """Read a model; `capture` gives the rig, and the head where none was laid.
 
-        Its field is not looked at unless `with_field`. Raises `ModelError` naming what is missing.
+        Its field is left out unless `with_field`. Raises `ModelError` naming what is missing.
         """
         appearance, strands = FittedAppearance.load(model), model.strands()
         maps, placed = HairMaps.of(appearance.hair), model.root_uv(strands)
@@ -96,21 +96,15 @@ class FittedModel:
 
     @classmethod
     def alternatives(cls, model: Model, capture: Capture) -> dict[str, FittedModel]:
-        """Both fits, where inverse rendering was run: "sun_fit" and "inverse_rendering".
+        """Both fits without a field, "sun_fit" and "inverse_rendering".
 
-        Without a field.
-        One of them is what `load` gives; see `fit_validated`.
+        Empty if the model is rendered with Sun's fit.
         """
-        ours = cls.load(model, capture, with_field=False)
-        for folder in (model, model.rejected()):
-            if folder.has("hair_maps.npz"):
-                maps, placed = HairMaps.load(folder)
-                lights = tuple(lights_as_found(folder, capture.rig.lights))
-                rig = replace(capture.rig, lights=lights)
-                sun = replace(ours, maps=HairMaps.of(ours.appearance.hair), rig=capture.rig)
-                found = replace(ours, maps=maps, placed=placed, rig=rig)
-                return {"sun_fit": sun, "inverse_rendering": found}
-        return {}
+        if not model.has("hair_maps.npz"):
+            return {}
+        found = cls.load(model, capture, with_field=False)
+        sun = replace(found, maps=HairMaps.of(found.appearance.hair), rig=capture.rig)
+        return {"sun_fit": sun, "inverse_rendering": found}
 
     def save(self, model: Model) -> None:
         """Write a model that `load` reads back; the fit's report and pictures are not copied.
@@ -149,24 +143,6 @@ class FittedModel:
     def with_maps(self, maps: HairMaps) -> FittedModel:
         """The same with another material."""
         return replace(self, maps=maps)
-
-    def with_field_of(self, model: Model, kind: str | None) -> FittedModel:
-        """The same with the model's field of this `kind`, also one that was rejected.
-
-        "none" is without; None leaves it as it is. Raises `ModelError` where there is no such one.
-        """
-        if kind is None or (self.field is not None and self.field.kind == kind):
-            return self
-        if kind == "none":
-            return self.without_field()
-        if model.rejected().has(FIELD_FILE):
-            field = Field.load(model.rejected())
-            if field.kind == kind:
-                return replace(self, field=field)
-        raise ModelError(
-            f"{model} has no field of the kind {kind}: run 'hairstage fit CAPTURE {model} --field "
-            f"{kind}' first"
-        )
 
     def without_field(self) -> FittedModel:
         """The same as its material alone shows it."""

@@ -13,7 +13,7 @@ from appearance.fields.field import FIELD_FILE
 from appearance.fields.options import FieldRequest
 from appearance.fields.pipeline import Rendered, fit_field
 from appearance.inverse_rendering.options import InverseRenderingRequest
-from appearance.inverse_rendering.pipeline import fit_maps
+from appearance.inverse_rendering.pipeline import FILES, fit_maps
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from reconstruction import Capture, Model, Progress, silent
@@ -34,8 +34,8 @@ def fit_validated(
     Of the lights that are not `held_out`, `request.lights` are fitted and others judge,
     `request.validation_lights` or a quarter of them all: directions far apart. Where whole training
     pictures are not clearly better, or the mean PSNR of the validation frames is not higher than
-    that of Sun's fit, maps and lights go to the model's folder "rejected" with a warning in the
-    report: whatever is rendered later is Sun's fit. Returns what `fit_maps` does, with
+    that of Sun's fit, maps and lights are discarded with a warning in the report: whatever is
+    rendered later is Sun's fit. Returns what `fit_maps` does, with
     `{"validation": {"start" | "inverse_rendering": {"psnr", "ssim", "relative_error"}}}` instead of
     "held_out", and "rendered": "inverse_rendering" or "sun_fit".
     """
@@ -64,7 +64,8 @@ def fit_validated(
         sun, found = (validation[name]["psnr"] for name in ("start", "inverse_rendering"))
         if found <= sun:
             rendered = "sun_fit"
-            model.reject("hair_maps.npz", "lights.json")
+            for name in FILES:
+                model.remove(name)
             better = "is better" if found < sun - 0.005 else "is as good"
             stage.warn(
                 f"Sun's fit {better} on frames that neither was fitted to, {sun:.2f} dB against "
@@ -95,11 +96,11 @@ def fit_field_validated(
     Of the lights that are not `held_out`, `request.lights` are used: directions far apart. Cameras
     and lights are left out in turn, and the field is rendered later where pictures under new
     lights, of new views, and of both each gain by it, and together more than twice the spread;
-    otherwise it goes to the model's folder "rejected", with a warning in the report, and an earlier
-    field stays. What is kept is fitted to all of the frames. Writes `field.npz` and the stage
-    "field" of the report. Returns `{"validation": {group: {"without", "with", "spread"}} in dB,
+    otherwise it is discarded, with a warning in the report, and an earlier field stays. What is
+    kept is fitted to all of the frames. Writes `field.npz` and the stage "field" of the report.
+    Returns `{"validation": {group: {"without", "with", "spread"}} in dB,
     "gain" (and its spread, None where nothing could be left out), "rendered", "ridge", "clamped",
-    "lights"}`, or "left_out" where no field is asked for; that removes an earlier one.
+    "lights"}`, or "left_out" for the field "none", which removes an earlier one.
     """
     held_out, request = held_out or HeldOut(), request or FieldRequest()
     report = model.report()
@@ -107,7 +108,7 @@ def fit_field_validated(
         model.remove(FIELD_FILE)
         report.drop("field")
         model.write_report(report)
-        return {"left_out": "no field was asked for"}
+        return {"left_out": "the requested field is 'none'"}
     training = held_out.training(capture)
     names = training.olat_lights()
     directions = np.array([training.rig.light(name).position for name in names])
@@ -120,12 +121,12 @@ def fit_field_validated(
             mapped.scene,
             tuple(fitted.lights(used)),
             fitted.appearance.exposure.scale,
-            fitted.maps.beta_m,
         )
         found = fit_field(training, model, base, request, progress, seed)
         stage.warnings += found.warnings
         doubts = found.doubts()
-        found.field.save(model.rejected() if doubts else model)
+        if not doubts:
+            found.field.save(model)
         stays = ", the earlier field stays" if doubts and model.has(FIELD_FILE) else ""
         for doubt in doubts:
             stage.warn(f"{request.field}, {doubt}: it is not rendered{stays}")

@@ -64,7 +64,7 @@ def evaluate_geometry(
 def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
-    Fitted is what is rendered; where inverse rendering was run, both fits also stand by themselves
+    Fitted is what is rendered; if that is inverse rendering, both fits are listed as well
     (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells. Sun's fit has
     the 95 % interval of its roughness, `beta_m_interval`, and standard errors of logarithms,
     `beta_m_error` and `sigma_a_error (3,)`, None in a channel whose colour does not determine it.
@@ -94,11 +94,8 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
         out["fitted"]["beta_m_interval"] = list(sun.beta_m_interval)
     if sun.sigma_a_error is not None:
         out["fitted"]["sigma_a_error"] = list(sun.sigma_a_error)
-    for folder in (model, model.rejected()):
-        if folder.has("hair_maps.npz"):
-            out["sun_fit"] = out["fitted"]
-            maps = HairMaps.load(folder)[0]
-            out["inverse_rendering"] = figures(maps, sun.skin)
-            out["fitted"] = out["inverse_rendering" if folder is model else "sun_fit"]
+    if model.has("hair_maps.npz"):
+        out["sun_fit"] = out["fitted"]
+        out["fitted"] = out["inverse_rendering"] = figures(HairMaps.load(model)[0], sun.skin)
     out["true"] = figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"])
     return out

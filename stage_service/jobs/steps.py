@@ -75,10 +75,10 @@ def fit(context: StepContext) -> Figures:
 
 
 def inverse_rendering(context: StepContext) -> Figures:
-    """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`, or in
-    `rejected` where Sun's fit is better on frames that neither was fitted to.
+    """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`.
 
-    The message of its progress holds the current error. Killed, it goes on from its checkpoint.
+    Discarded if Sun's fit is better on frames that neither was fitted to. The message of its
+    progress holds the current error. Killed, it resumes from its checkpoint.
     """
     from appearance import fit_validated as run
 
@@ -86,8 +86,10 @@ def inverse_rendering(context: StepContext) -> Figures:
 
 
 def fields(context: StepContext) -> Figures:
-    """What the hair reflects beyond its material: `field.npz`, or in `rejected` where pictures that
-    it was not fitted to are better without it. Killed, it goes on behind the views that were done.
+    """A field of reflectance on top of the material: `field.npz`.
+
+    Discarded if images that it was not fitted to are better without it. Killed, it resumes after
+    the last view that was done.
     """
     from appearance import fit_field_validated as run
 

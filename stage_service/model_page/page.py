@@ -194,10 +194,6 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
         yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
     if model.has(FIELD_FILE):
         yield "field", [link(FIELD_FILE), ": what the hair reflects beyond that is rendered too"]
-    rejected = {"hair_maps.npz": "inverse rendering", FIELD_FILE: "the field of reflectance"}
-    for name, what in rejected.items():
-        if model.rejected().has(name):
-            yield "not used", [f"{what}, not clearly better: ", link(f"rejected/{name}")]
 
 
 def _swatch(linear: Sequence[float]) -> Html:

@@ -17,7 +17,7 @@ from stage_service.cli.support.commands import (
 )
 
 METHODS = ("sun", "inverse_rendering")
-FIELDS = ("none", "best", "turns", "modulation", "additive")
+FIELDS = ("none", "modulation", "additive")
 
 
 def add(commands: Commands) -> None:
@@ -30,9 +30,8 @@ def add(commands: Commands) -> None:
     fit.add_argument(
         "--field",
         choices=FIELDS,
-        help="then fit what the hair reflects beyond its material: a smooth factor on its light "
-        "(modulation), a factor and turns of its fibres (turns), the better of these (best), or "
-        "light that is added (additive); none removes it",
+        help="then fit a field of reflectance on top of the material: a smooth factor on its light "
+        "(modulation) or light added to it (additive); none removes it",
     )
     fit.add_argument("--field-options", help="the field's options as JSON")
     add_view(fit)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from reconstruction import Camera, Capture, Light, Model, Progress, Strands
     from reconstruction.arrays import Floats
 
-FIELDS = ("none", "turns", "modulation", "additive", "interpolation")
+FIELDS = ("none", "interpolation")
 SIZE, FILM_SIZE = 512, 192
 """Pixels across of a picture and of an animation, where no camera of a rig says."""
 MOST_SIZE = 16_384
@@ -48,8 +48,8 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--field",
         choices=FIELDS,
-        help="show the model with its field of this kind, or without one, or its hair interpolated "
-        "between the frames of --capture; default: the model as it is",
+        help="none: without the model's field; interpolation: the hair interpolated between the "
+        "frames of --capture; default: the model with its field, if it has one",
     )
     render.add_argument(
         "--guide",
@@ -138,8 +138,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         args.out.parent.mkdir(parents=True, exist_ok=True)
     progress("building the scene", 0.0)
     model = Model(args.model)
-    of_model = None if args.field == "interpolation" else args.field
-    fitted = FittedModel.load(model, capture).with_field_of(model, of_model)
+    fitted = FittedModel.load(model, capture, with_field=args.field != "none")
     if capture is not None and args.camera is not None:
         camera = capture.rig.camera(args.camera)
     else:

@@ -9,13 +9,12 @@ import pytest
 
 from appearance.fields.anchors import Grid, Places, nested
 from appearance.fields.basis import ViewBasis
-from appearance.fields.fit import FieldFit, Monitor, fit_pictures
+from appearance.fields.fit import Monitor, fit_pictures
 from appearance.fields.form import Form
 from appearance.fields.grams import Gram, Samples
 from appearance.fields.options import FieldOptions
-from appearance.fields.pipeline import better
-from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
-from appearance.fields.validation import GROUPS, Folds, _elsewhere
+from appearance.fields.solver import LeastSquares, Seen, conjugate_gradients
+from appearance.fields.validation import Folds, _elsewhere
 from appearance.render.harmonics import harmonics
 from reconstruction import BadOptions, Light, parse_options
 from reconstruction.files import durable
@@ -61,13 +60,18 @@ def test_the_gram_is_the_error_of_the_pictures_it_was_made_of(planted):
     gram = Gram.of(samples, 2)
     rng = np.random.default_rng(0)
     g = 0.2 * rng.normal(size=(len(view.hits.pixels), 9, 3)).astype(np.float32)
-    total = 0.0
-    for i, light in enumerate(view.lights):
-        y = harmonics(light.position - view.hits.middle(), 2)
-        shown = view.halves[0, i] * planted.scale * (1 + np.einsum("pn,pnc->pc", y, g))
-        off = (shown - view.captured[i] * planted.scale) ** 2 * samples.weight[i]
-        total += float(off[view.valid[i]].sum())
-    assert gram.error(g) == pytest.approx(total, rel=1e-4)
+
+    def error(g):
+        total = 0.0
+        for i, light in enumerate(view.lights):
+            y = harmonics(light.position - view.hits.middle(), 2)
+            shown = view.halves[0, i] * planted.scale * (1 + np.einsum("pn,pnc->pc", y, g))
+            off = (shown - view.captured[i] * planted.scale) ** 2 * samples.weight[i]
+            total += float(off[view.valid[i]].sum())
+        return total
+
+    change = np.sum(g * (gram.times(g[..., None])[..., 0] - 2 * gram.right), dtype=float)
+    assert change == pytest.approx(error(g) - error(0 * g), rel=1e-4)
     assert samples.weight[2, ::3].max() == 0
 
 
@@ -114,18 +118,11 @@ def system_of(planted, views, ridge, degree=1):
     ), samples
 
 
-def test_conjugate_gradients_and_adam_go_to_the_same_minimum(planted):
-    system, samples = system_of(planted, planted.views(planted.truth(), 4)[:2], 0.03)
+def test_conjugate_gradients_solve_the_normal_equations(planted):
+    system, _ = system_of(planted, planted.views(planted.truth(), 4)[:2], 0.03)
     found = conjugate_gradients(system, 200, 1e-5)
-    least = system.objective(found)
-    rng = np.random.default_rng(0)
-    for size in (1e-2, -1e-2):
-        off = size * rng.normal(size=found.shape).astype(np.float32)
-        assert system.objective(found + off) > least
-    start = system.objective(np.zeros_like(found))
-    reference = adam(system, samples, AdamOptions(0.005, 1500))
-    assert (system.objective(reference) - least) / (start - least) < 0.05
-    assert np.abs(reference - found).max() < 0.3 * np.abs(found).max()
+    right = system.right()
+    np.testing.assert_allclose(system.times(found), right, atol=1e-3 * np.abs(right).max())
 
 
 def test_folds_solved_at_once_are_what_they_are_one_by_one(planted):
@@ -287,18 +284,8 @@ def per_view(planted, seed, noise=0.05):
     return out
 
 
-def test_of_two_kinds_one_without_doubt_is_better_than_one_that_gains_more():
-    def judged(gain, spread):
-        groups = {g: {"without": 20.0, "with": 20 + gain, "spread": spread} for g in GROUPS}
-        return FieldFit(None, 0.1, groups, (gain, spread), [], 0.0)
-
-    sure, unsure = judged(0.45, 0.05), judged(0.5, 0.4)
-    assert better([unsure, sure]) is sure
-    assert better([unsure, judged(0.3, 0.4)]) is unsure
-
-
 @pytest.mark.parametrize(
-    "wrong", [{"ridges": []}, {"stiffness": []}, {"levels": []}, {"levels": [[4, 0, 3]]}], ids=str
+    "wrong", [{"ridges": []}, {"levels": []}, {"levels": [[4, 0, 3]]}], ids=str
 )
 def test_options_that_no_fit_could_have_are_refused_before_it(wrong):
     with pytest.raises(BadOptions):

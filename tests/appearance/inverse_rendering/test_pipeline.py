@@ -165,9 +165,8 @@ def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monk
     found = fit_maps(capture, other, held_out=HELD_OUT, request=request)
     assert not found["accepted"]
     assert found["error"] > found["start_error"]
-    fits = FittedModel.alternatives(other, capture)
     assert FittedModel.load(other, capture).maps.sigma_a.max() == pytest.approx(0.2)
-    assert fits["inverse_rendering"].maps.sigma_a.max() == pytest.approx(0.001, rel=1e-3)
+    assert not other.has("hair_maps.npz")
     (warning,) = other.report()["inverse_rendering"].warnings
     assert warning.startswith("original: whole training pictures are not clearly better")
 

@@ -110,29 +110,7 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
         assert with_it[1] / without[1] == pytest.approx(1, rel=0.08)
     assert not model.work("field").exists()
     assert not [w for w in model.report()["field"].warnings if "not rendered" in w]
-    assert fitted.with_field_of(model, "none").field is None
-    with pytest.raises(ModelError, match="no field of the kind additive"):
-        fitted.with_field_of(model, "additive")
-
-
-@pytest.mark.parametrize("weak", ["turns", pytest.param("modulation", marks=pytest.mark.slow)])
-def test_the_kind_stays_whose_left_out_pictures_gain_more(own, monkeypatch, weak):
-    """The other is held at 0 by its ridge, so that nothing is gained by it."""
-    capture, model = own
-    right, judged, found = pipeline.fit_pictures, validated.fit_field, []
-
-    def fitted(views, places, scale, options, monitor):
-        held = (1e9,) if options.kind == weak else options.ridges
-        return right(views, places, scale, replace(options, ridges=held), monitor)
-
-    def kept(*args, **more):
-        found.append(judged(*args, **more))
-        return found[-1]
-
-    monkeypatch.setattr(pipeline, "fit_pictures", fitted)
-    monkeypatch.setattr(validated, "fit_field", kept)
-    fit_field_validated(capture, model, request=replace(REQUEST, field="best"))
-    assert {found[0].field.kind, weak} == {"turns", "modulation"}
+    assert FittedModel.load(model, capture, with_field=False).field is None
 
 
 def test_edited_hair_keeps_its_field(own, tmp_path):
@@ -174,18 +152,12 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
     monkeypatch.setattr(validated, "fit_field", worse)
     result = fit_field_validated(capture, model, request=REQUEST)
     assert not result["rendered"]
-    fitted = FittedModel.load(model, capture)
-    assert fitted.field is None
-    assert fitted.with_field_of(model, "modulation").field is not None
+    assert FittedModel.load(model, capture).field is None
     warnings = model.report()["field"].warnings
-    told = "new lights: pictures are better without it, 30.00 dB against 29.50"
-    assert sum(told in w for w in warnings) == 1
-    assert fit_field_validated(capture, model, request=FieldRequest("none")) == {
-        "left_out": "no field was asked for"
-    }
+    assert sum("30.00 dB against 29.50" in w for w in warnings) == 1
 
 
-def test_an_earlier_field_stays_until_a_better_one_is_known_or_none_is_asked_for(own, monkeypatch):
+def test_an_earlier_field_stays_until_a_better_one_or_none_replaces_it(own, monkeypatch):
     capture, model = own
     right, found = validated.fit_field, []
 
@@ -211,7 +183,6 @@ def test_an_earlier_field_stays_until_a_better_one_is_known_or_none_is_asked_for
     monkeypatch.setattr(validated, "fit_field", doubted)
     assert not fit_field_validated(capture, model, request=REQUEST)["rendered"]
     assert model.file("field.npz").read_bytes() == was
-    assert model.rejected().has("field.npz")
     (warning,) = [w for w in model.report()["field"].warnings if "better without" in w]
     assert warning.endswith("it is not rendered, the earlier field stays")
     fit_field_validated(capture, model, request=FieldRequest("none"))
@@ -225,7 +196,7 @@ def test_of_one_camera_and_three_lights_none_is_left_out_and_the_field_is_not_re
     result = fit_field_validated(few, model, request=REQUEST)
     assert not result["rendered"]
     assert result["gain"] == [0.0, None]
-    assert model.rejected().has("field.npz")
+    assert not model.has("field.npz")
     told = model.report()["field"].warnings
     assert sum("nothing could be left out" in w for w in told) == 1
 

@@ -1,4 +1,4 @@
-"""Fields of reflectance beside what they have to beat, and their solver beside Adam.
+"""Fields of reflectance beside their baselines.
 
 On `frames_of` a groom. Frames interpolated on the bent strands are judged on the same pixels.
 "brightest" adds what an additive field has from a map's brightest direction alone, with all its
@@ -28,6 +28,7 @@ from appearance.fields.search import searched
 from appearance.fields.validation import GROUPS
 from benchmarks.appearance.known_subjects import SmallStage
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, option
+from benchmarks.fields.cost import cost
 from benchmarks.fields.fitted import captured_of, fitted_frames
 from benchmarks.fields.frames import (
     HELD_VIEWS,
@@ -38,7 +39,6 @@ from benchmarks.fields.frames import (
     summed,
     under_maps,
 )
-from benchmarks.fields.solvers import cost, curves, ratio
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
 from reconstruction import Progress, silent
@@ -61,9 +61,7 @@ FIELDS = {
     "modulation, degree 0": FieldOptions("modulation", degree=0),
     "modulation, degree 1": FieldOptions("modulation"),
     "modulation, degree 2": FieldOptions("modulation", degree=2),
-    "turns": FieldOptions("turns"),
 }
-BOTH = ("modulation, degree 1", "turns")
 SIZES = {"full": STAGE, "quick": SmallStage(12, cameras=4, lights=8, spp=16, max_depth=3)}
 
 
@@ -133,9 +131,6 @@ def rows_of(
     for name, options in fields.items():
         progress(name, 0.5)
         rows[name] = row_of(frames, training, options)
-    both = [rows[name] for name in BOTH if name in rows]
-    if len(both) == len(BOTH):
-        rows["the better of both, by validation"] = max(both, key=lambda row: row["gain"][0])
     return rows
 
 
@@ -172,7 +167,7 @@ def run_bench(
     fields: Mapping[str, FieldOptions] = FIELDS,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The table of `fields`, a seed for each of `subjects`, and the solvers on the last."""
+    """The table of `fields`, a seed for each of `subjects`."""
     result: dict[str, Any] = {"rig": asdict(rig), "seeds": []}
     for k, subject in enumerate(subjects):
         progress(f"seed {seed + k}: frames", k / len(subjects))
@@ -182,11 +177,6 @@ def run_bench(
         result["seeds"].append(
             {"frames_cpu_seconds": made, "rows": rows_of(frames, fields, progress)}
         )
-        if k == len(subjects) - 1:
-            training = frames.training()
-            quick = rig is SIZES["quick"]
-            result["solvers"] = curves(training, frames.places, frames.scale, quick=quick)
-            result["ratio"] = ratio(result["solvers"])
         save(out / "fields.json", result)
     (out / "fields.md").write_text(report(result))
     return result
@@ -230,19 +220,8 @@ def report(result: Mapping[str, Any]) -> str:
         cells += [_gains([rows[name]["gains"] for rows in seeds if "gains" in rows[name]])]
         kept = [rows[name]["kept"] for rows in seeds if "kept" in rows[name]]
         lines.append([name, *cells, f"{sum(kept)} of {len(kept)}" if kept else ""])
-    text = (
-        markdown(["model", *GROUPS, MAPPED, BRIGHTEST, "fit, CPU s", "gains", "kept"], lines) + "\n"
-    )
-    for name, curve in result.get("solvers", {}).items():
-        points = ", ".join(f"{p['cpu_seconds']:.2f} s: {p['above']:.1e}" for p in curve)
-        text += f"- {name}: {points}\n"
-    least = result.get("ratio", {})
-    if "cpu_seconds" in least:
-        text += (
-            f"- to {least['above']:.1e}: {least['cpu_seconds']:.2f} s, "
-            f"Adam {least['adam_cpu_seconds']:.2f} s\n"
-        )
-    return text
+    heads = ["model", *GROUPS, MAPPED, BRIGHTEST, "fit, CPU s", "gains", "kept"]
+    return markdown(heads, lines) + "\n"
 
 
 def _gains(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> str:

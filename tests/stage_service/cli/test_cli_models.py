@@ -151,7 +151,7 @@ def test_a_field_goes_on_the_fit_that_is_there_but_where_options_ask_for_another
     called = []
     for name in ("fit", "fields"):
         monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
-    words = (capsys, "fit", made.capture, made.model, "--field", "best")
+    words = (capsys, "fit", made.capture, made.model, "--field", "modulation")
     assert run(*words)[0] == 0
     assert called == ["fields"]
     assert run(*words, "--options", '{"hair_pixels": 77}')[0] == 0

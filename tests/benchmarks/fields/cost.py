@@ -1,86 +1,26 @@
-"""The fields' solver: its error against CPU time beside Adam's, and what a fit of a size costs."""
+"""CPU seconds and memory of a field's fit, by its size."""
 
 from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from appearance.fields.anchors import Grid, Places, nested
-from appearance.fields.basis import ViewBasis
+from appearance.fields.anchors import Places
 from appearance.fields.fit import Monitor, fit_pictures
-from appearance.fields.form import Form
-from appearance.fields.grams import Gram
 from appearance.fields.hits import RECORD, Hits
-from appearance.fields.options import FieldOptions, FieldRequest
+from appearance.fields.options import FieldRequest
 from appearance.fields.pictures import Pictures
 from appearance.fields.pipeline import memory_needed
-from appearance.fields.solver import AdamOptions, LeastSquares, Seen, adam, conjugate_gradients
 from reconstruction import Camera, Light, Progress
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import Array
 from reconstruction.geometry.lights import dome_positions
 
-Curve = list[dict[str, float]]
-RATES = (0.003, 0.01, 0.03)
 STRANDS = 10_000
 RADIUS = 0.1
-
-
-def curves(
-    views: Sequence[Pictures], places: Places, scale: float, *, quick: bool = False
-) -> dict[str, Curve]:
-    """Objective above its minimum, as a share of that of no field, against CPU seconds."""
-    options = FieldOptions("modulation")
-    grids = [Grid.of(level, len(places.fitted)) for level in options.grids]
-    samples = [p.samples(options, scale) for p in views]
-    begun = time.process_time()
-    grams = [Gram.of(s, options.degree) for s in samples]
-    reducing = time.process_time() - begun
-    seen = [
-        Seen(ViewBasis.of(p.hits, grids[-1], places, options.degree, in_strands=True), [g])
-        for p, g in zip(views, grams, strict=True)
-    ]
-    system = LeastSquares(seen, nested(grids, places), Form.of(options), 0.03)
-    least = system.objective(conjugate_gradients(system, 12 if quick else 80, 1e-6))
-    start = system.objective(np.zeros(system.shape, np.float32))
-    found: dict[str, Curve] = {}
-
-    def watch(name: str, every: int, offset: float) -> Any:
-        curve = found.setdefault(name, [])
-        clock = [time.process_time() - offset]
-
-        def note(done: int, x: Floats, _: float) -> None:
-            if done % every == 0:
-                now = time.process_time()
-                above = (system.objective(x) - least) / (start - least)
-                curve.append({"cpu_seconds": now - clock[0], "above": float(above)})
-                clock[0] += time.process_time() - now
-
-        return note
-
-    conjugate_gradients(system, 24, 1e-6, None, watch("conjugate gradients", 1, reducing))
-    steps = 30 if quick else 600
-    for rate in RATES:
-        note = watch(f"Adam, rate {rate:g}", max(1, steps // 6), 0.0)
-        adam(system, samples, AdamOptions(rate, steps), note)
-    return found
-
-
-def ratio(found: dict[str, Curve]) -> dict[str, float]:
-    """The best error that Adam reached, its CPU seconds, and those of conjugate gradients to it."""
-    ours = found["conjugate gradients"]
-    best = min((p for n, c in found.items() if n.startswith("Adam") for p in c), key=_above)
-    there = [p["cpu_seconds"] for p in ours if p["above"] <= best["above"]]
-    out = {"above": best["above"], "adam_cpu_seconds": best["cpu_seconds"]}
-    return out | ({"cpu_seconds": there[0]} if there else {})
-
-
-def _above(point: dict[str, float]) -> float:
-    return point["above"]
 
 
 def cost(size: tuple[int, int, int], folder: Path, seed: int, progress: Progress) -> dict[str, Any]:
