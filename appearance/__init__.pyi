@@ -13,7 +13,6 @@ from .model.relight import relight as relight
 from .model.validated import fit_field_validated as fit_field_validated
 from .model.validated import fit_validated as fit_validated
 from .observations import HeldOut as HeldOut
-from .render.differentiable import DifferentiableOlat as DifferentiableOlat
 from .render.environment import render_environment as render_environment
 from .render.mixed import Environment as Environment
 from .render.mixed import render_mixed as render_mixed

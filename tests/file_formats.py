@@ -20,7 +20,6 @@ from appearance.bsdf.maps import HairMaps
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.field import Field
 from appearance.inverse_rendering.found_lights import save_lights
-from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.render.environment_maps import load_environment
 from appearance.render.harmonics import count_of
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -235,7 +234,7 @@ def _of_model(name: str) -> Callable[[Path], tuple[Path, Callable[[Path], Any]]]
         model.write_arrays("scalp_map.npz", {"roots": root_uv})
         FittedAppearance(hair, skin, skin, Exposure(1.0), 0.1, 0.1, 0.1, HeldOut()).save(model)
         HairMaps.of(hair, (2, 2, 2)).save(model, root_uv)
-        save_lights(model, LightDeviations.calibrated(1), light)
+        save_lights(model, np.ones(1), light)
         rows, values = np.array([0, 3]), np.ones((2, 3 * count_of(1) ** 2), np.float32)
         Field("modulation", 1, Grid(2, 2, 2, 0), Places.of(root_uv), rows, values).save(model)
         PointCloud.empty(("cam_0",), ("left",)).save(model.file("points.npz"))

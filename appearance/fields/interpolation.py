@@ -82,8 +82,8 @@ class Interpolation:
     Standard interpolation where `model` is None: the samples' weighted mean. With a model B each
     sample I_ij is first scaled by (B + ε)/(B_ij + ε) (Photobooth, Eq. 5, with a bounded gain), ε
     being `floor` times the mean of B. Samples are divided by the irradiance of their own lights
-    first, and multiplied by that of the new one. `kriged` says how lights are weighted
-    (`light_weights`); cameras are barycentric, of those that see the place (`camera_weights`).
+    first, and multiplied by that of the new one. Lights have radial weights (`light_weights`),
+    cameras barycentric ones, of those that see the place (`camera_weights`).
 
     `sources` and `mapped` are in the pose of the capture, that of `strands`.
     """
@@ -93,7 +93,6 @@ class Interpolation:
     mapped: MappedStrands
     strands: Strands
     model: KajiyaKay | None = None
-    kriged: bool = False
     floor: float = FLOOR
 
     @classmethod
@@ -118,7 +117,7 @@ class Interpolation:
             _unit(np.array([x.position for x in many]) - self.middle).astype(float)
             for many in (self.field.lights, lights)
         )
-        return light_weights(captured, new, kriged=self.kriged)
+        return light_weights(captured, new)
 
     def without(self, cameras: Sequence[str] = (), lights: Sequence[str] = ()) -> Interpolation:
         """The same without some cameras and lights."""

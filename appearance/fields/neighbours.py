@@ -11,10 +11,6 @@ from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 RADIAL = 6
 """Neighbours of a light with radial weights; Photobooth takes about as many."""
-KRIGED = 12
-REACH = 0.3
-"""Radians over which samples of one place are taken to be alike; 0.2 to 0.4 does as well."""
-_NUGGET = _LEAST = 1e-6
 
 
 def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
@@ -45,43 +41,23 @@ def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
     return out / out.sum()
 
 
-def light_weights(
-    directions: AnyFloats, towards: AnyFloats, *, kriged: bool = True
-) -> tuple[Ints, Floats]:
+def light_weights(directions: AnyFloats, towards: AnyFloats) -> tuple[Ints, Floats]:
     """Of each direction `towards (T, 3)` the nearest lights `(T, k)` and their weights `(T, k)`.
 
-    Unit `directions (L, 3)`. The weights are those of least error for samples whose covariance
-    falls with the angle as exp(-angle/`REACH`) (ordinary kriging of `KRIGED` lights); those below
-    0 count as next to nothing. Not `kriged`, as in Photobooth §4.1: radial ones of `RADIAL` lights,
-    Franke and Little's ((R - d)/(R d))² of the angle d, R that of the next light. Both vary
-    continuously, or very nearly, and give a light's own direction to it alone, in equal parts to
-    lights in one place. Rows sum to 1.
+    Unit `directions (L, 3)`. The weights are radial ones of `RADIAL` lights (Photobooth §4.1):
+    Franke and Little's ((R - d)/(R d))² of the angle d, R that of the next light. They vary
+    continuously, and give a light's own direction to it alone, in equal parts to lights in one
+    place. Rows sum to 1.
     """
     cosine = np.clip(towards @ directions.T, -1, 1)
-    count = min(KRIGED if kriged else RADIAL, len(directions))
+    count = min(RADIAL, len(directions))
     order = np.argsort(-cosine, axis=1, kind="stable")
     angle = np.arccos(np.take_along_axis(cosine, order[:, : count + 1], axis=1))
     near, order = angle[:, :count], order[:, :count]
-    if kriged:
-        # where samples are missing, those that would weigh nothing stand in for them
-        weight = np.maximum(_kriged(directions[order], near), _LEAST * np.exp(-near / REACH))
-    else:
-        reach = angle[:, -1:] if len(directions) > count else np.full((len(towards), 1), 2 * np.pi)
-        left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # where all are as far: alike
-        weight = (left / np.maximum(near, 1e-5)) ** 2
+    reach = angle[:, -1:] if len(directions) > count else np.full((len(towards), 1), 2 * np.pi)
+    left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # where all are as far: alike
+    weight = (left / np.maximum(near, 1e-5)) ** 2
     return order, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def _kriged(directions: AnyFloats, angle: Array) -> Array:
-    """Weights `(T, k)` of lights `(T, k, 3)` at so many radians `(T, k)`, summing to 1."""
-    count = angle.shape[1]
-    between = np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1))
-    system = np.ones((len(angle), count + 1, count + 1))
-    system[:, :count, :count] = np.exp(-between / REACH) + _NUGGET * np.eye(count)
-    system[:, count, count] = 0
-    right = np.ones((len(angle), count + 1, 1))
-    right[:, :count, 0] = np.exp(-angle / REACH)
-    return np.asarray(np.linalg.solve(system, right)[:, :count, 0])
 
 
 def _triangles(directions: AnyFloats) -> Ints:

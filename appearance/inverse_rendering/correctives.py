@@ -120,10 +120,7 @@ class _View:
 
 def _patches(problem: FitProblem, lights: Ints) -> list[Patch]:
     """All pixels of all views under `lights`."""
-    return [
-        Patch(k, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
-        for k, o in enumerate(problem.views)
-    ]
+    return [Patch(k, lights, np.arange(len(o.pixels))) for k, o in enumerate(problem.views)]
 
 
 def _error(views: list[_View], maps: HairMaps) -> float:

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from appearance.inverse_rendering.unknowns import LightDeviations
 from reconstruction import Light, Model, ModelError
+from reconstruction.arrays import Array
 
 LIGHTS_FILE = "lights.json"
 
 
-def save_lights(model: Model, found: LightDeviations, lights: Sequence[Light]) -> None:
-    """Write the calibrated `lights` as `found`, and how each differs from its calibration."""
+def save_lights(model: Model, gain: Array, lights: Sequence[Light]) -> None:
+    """Write the calibrated `lights` with their intensities times `gain (L,)`, and those factors."""
     rows = [
-        {
-            **light.to_dict(),
-            "moved_m": found.position[i].tolist(),
-            "turned_rad": found.turn[i].tolist(),
-            "gain": float(found.gain[i]),
-            "profile_scale": float(found.profile[i]),
-        }
-        for i, light in enumerate(found.applied(lights))
+        {**replace(light, intensity=light.intensity * g).to_dict(), "gain": float(g)}
+        for light, g in zip(lights, gain, strict=True)
     ]
     model.write_json(LIGHTS_FILE, rows)
 
@@ -48,5 +41,6 @@ def lights_as_found(model: Model, lights: Sequence[Light]) -> list[Light]:
 def _as_found(light: Light, row: Mapping[str, Any] | None) -> Light:
     if row is None:
         return light
-    names = ("moved_m", "turned_rad", "gain", "profile_scale")
-    return LightDeviations(*(np.array([row[n]], float) for n in names)).applied([light])[0]
+    # 0.1 wrote a second factor, shared by the lights of one profile
+    factor = float(row["gain"]) * float(row.get("profile_scale", 1.0))
+    return replace(light, intensity=light.intensity * factor)

@@ -1,4 +1,4 @@
-"""What a fit minimises: an image loss on hair pixels, and smoothness along strands.
+"""The image loss on hair pixels that a fit minimises.
 
 Everything is a mean, in exposure units, so that weights mean the same at any resolution. The
 papers' L1 fits the median of a path tracer's noise, which lies far below its mean. Squared
@@ -8,9 +8,6 @@ values. Their square root is minimised: as proportional to the difference as L1 
 
 from __future__ import annotations
 
-from typing import Any
-
-import drjit as dr
 import numpy as np
 from scipy.ndimage import correlate1d
 
@@ -20,11 +17,10 @@ FLOOR = 0.03
 LEAST_NOISE = 0.1
 """Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
 LEAST_ERROR = 0.02
-"""Of the root of the squares: below it smoothness gets no more say."""
-LAMBDA_SIGMA, LAMBDA_R = 0.5, 0.003
-"""Weights of smoothness along strands, of absorption, and of correctives: GroomLight's 10 forbids
-turns that undo a bend of 5°. Between neighbours on the scalp too, where correctives are solved
-for."""
+"""Of the root of the squares: below it smoothness weighs no more."""
+LAMBDA_R = 0.003
+"""Weight of the differences of correctives between neighbours, along strands and on the scalp:
+GroomLight's 10 forbids the turns that undo a bend of 5°."""
 
 
 def level(captured: Array) -> Array:
@@ -63,37 +59,9 @@ def noise_weighted(weight: Array, squares: Array) -> Array:
     return np.asarray(out * (weight.sum() / out.sum()))
 
 
-def gradient(difference: Array, level: Array, valid: Bools, error: float) -> Array:
-    """Derivative of the image loss by the rendered values `(L, P, 3)`, in exposure units.
-
-    `difference` is rendered less captured; `valid (L, P)`; `error` an estimate of the mean of
-    the squares, of which the root is taken.
-    """
-    root = max(error, LEAST_ERROR**2) ** 0.5
-    out = difference * weights(level) / root
-    used = max(int(valid.sum()), 1) * 3
-    return np.where(valid[..., None], out, 0.0) / used
-
-
 def squares(one: Array, other: Array, weight: Array, valid: Bools) -> float:
     """Weighted mean square of the differences `one`, `other (L, P, 3)` of independent renderings.
 
     Without their noise: may be slightly negative where the renderings agree with the captured.
     """
     return float((one * other * weight)[valid].mean()) if valid.any() else 0.0
-
-
-def smoothness(values: dict[str, Any]) -> Any:
-    """λ_σ mean |σ_i − σ_(i−1)| + λ_R mean |R_i − R_(i−1)| over layers (GroomLight Eq. 4 and 5).
-
-    Cells whose strands no ray meets follow their neighbours along the strand. A Dr.Jit number, or
-    0 for a single layer.
-    """
-    total: Any = 0.0
-    for name, weight in (("hair.sigma_a", LAMBDA_SIGMA), ("hair.rotation", LAMBDA_R)):
-        table = values[name]
-        if table.ndim == 4 and table.shape[0] > 1 and dr.grad_enabled(table):
-            step = table[1:] - table[:-1]
-            # rounded off at a thousandth: no jitter about equal layers
-            total = total + weight * dr.mean(dr.sqrt(step * step + 1e-6), axis=None)
-    return total

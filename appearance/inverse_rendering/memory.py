@@ -49,8 +49,8 @@ class Sizes:
 def memory_needed(sizes: Sizes, options: InverseRenderingOptions) -> float:
     """GB that a fit takes, scene and kernels too, beside what the program holds before, about."""
     pixels, largest, lights = sum(sizes.views), max(sizes.views, default=0), sizes.lights
-    # the lights' intensities and places are further guesses
-    guesses = 4 if options.variant == "lights" else 2
+    # the start under the lights as found is a further guess
+    guesses = 3 if options.variant == "lights" else 2
     whole = largest * lights * (_WHOLE_BYTES + guesses * _GUESS_BYTES)
     kept = min(largest, options.effort.pixels) * max(FEWEST, 2 * options.effort.spp)
     turns = 0

@@ -17,7 +17,6 @@ from appearance.inverse_rendering.loop import SURE, Monitor, Outcome, run
 from appearance.inverse_rendering.memory import Sizes, memory_needed
 from appearance.inverse_rendering.options import InverseRenderingOptions, InverseRenderingRequest
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import scores_unavailable
 from appearance.observations import HeldOut, observe_hair
 from appearance.render.bounces import bounce_limit
@@ -57,7 +56,7 @@ def fit_maps(
     the report; a fit that was killed goes on from its checkpoint, which stays in the model until
     the fit is done, and so do an earlier fit and the field on top of it. If full training images
     are not clearly better with the result than with Sun's fit, it is discarded with a warning.
-    Returns `{"ended", "steps", "error", "start_error", "sure",
+    Returns `{"ended", "error", "start_error", "sure",
     "accepted", "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
     "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
     fit and of what was found; "doubts" are warnings for whoever renders what was found. Raises
@@ -86,16 +85,15 @@ def fit_maps(
         one_colour = fit.run(replace(options, variant="original"), start, None, (0.05, 0.3))
         outcome, taken = one_colour, one_colour.error < one_colour.start_error
         if options.variant != "original":
-            outcome = fit.run(options, one_colour.maps, one_colour.lights, (0.3, 0.9))
+            outcome = fit.run(options, one_colour.maps, one_colour.gain, (0.3, 0.9))
             taken = taken or outcome.error < outcome.start_error
         found = outcome if taken or outcome.refused is None else outcome.refused
         judged = Model(model.work("inverse_rendering")).create()
         found.maps.save(judged, mapped.root_uv)
-        save_lights(judged, found.lights, problem.lights)
+        save_lights(judged, found.gain, problem.lights)
         progress("judging held-out images", 0.92)
         result: dict[str, Any] = {
             "ended": outcome.ended,
-            "steps": outcome.steps,
             "start_error": one_colour.start_error,
             "error": found.error,
             "sure": outcome.sure,
@@ -212,23 +210,22 @@ class _Fit:
         self,
         options: InverseRenderingOptions,
         maps: HairMaps,
-        lights: LightDeviations | None,
+        gain: Array | None,
         share: tuple[float, float],
     ) -> Outcome:
-        """Fit from `maps` and `lights`; `share` is what it is of the progress."""
+        """Fit from `maps` and the lights' factors `gain (L,)`; `share`: part of the progress."""
         monitor = Monitor(part_of(self.progress, *share), self.model.checkpoint(options.variant))
-        outcome = run(self.problem, maps, lights, options=options, monitor=monitor, seed=self.seed)
+        outcome = run(self.problem, maps, gain, options=options, monitor=monitor, seed=self.seed)
         measured = "weighted mean squared difference, noise taken off"
         series = Series(f"inverse rendering, {options.variant}", measured)
-        series.points = [(seconds, error) for seconds, _, error in outcome.history]
+        series.points = list(outcome.history)
         self.stage.series.append(series)
         if outcome.refused is not None:
             self.stage.warn(
-                f"{options.variant}: whole training pictures are not clearly better with what was "
-                f"found, loss {outcome.refused.error:.4f} against {outcome.error:.4f} before "
-                f"(better in {outcome.sure:.0%} of random draws of parts of the hair, {SURE:.1%} "
-                f"are asked for): it is not taken"
+                f"{options.variant}: rejected, as the loss of full training images went from "
+                f"{outcome.error:.4f} to {outcome.refused.error:.4f}, lower in {outcome.sure:.0%} "
+                f"of random draws of parts of the hair ({SURE:.1%} are required)"
             )
-        elif outcome.steps < options.steps and outcome.ended != "converged":
+        elif outcome.ended != "converged":
             self.stage.warn(f"{options.variant}: {outcome.ended}")
         return outcome

@@ -1,29 +1,23 @@
-"""A fit's data and its two questions: how far off is a guess, and which way is down."""
+"""A fit's data, and how far a guess is off."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.inverse_rendering import losses
-from appearance.inverse_rendering.batches import Batch, Comparison, Pairs, Patch
+from appearance.inverse_rendering.batches import Batch, Comparison, Patch
 from appearance.inverse_rendering.linearised import LinearisedPictures
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.unknowns import LightDeviations, Raw, decode, encode, hair_values
+from appearance.inverse_rendering.unknowns import Raw, decode
 from appearance.observations import Observed
-from appearance.render.differentiable import DifferentiableOlat, ReplaySampling
 from appearance.render.kept_paths import KeptPaths, KeptSampling, WeightedPixels, keep_paths
 from appearance.render.olat import render_indirect, render_olat
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
-from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
 ValidationSet = Sequence[tuple[Patch, Array]]
@@ -40,19 +34,6 @@ _WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
 noise decides what is better. And parts of a view's hair, about."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
-
-
-@dataclass(frozen=True)
-class Objective:
-    """What a step minimises, by the numbers called `free`.
-
-    `error` is about what `FitProblem.error` says, of which the root is taken; `smooth` adds the
-    smoothness along strands.
-    """
-
-    free: Sequence[str]
-    error: float = 1.0
-    smooth: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,54 +74,11 @@ class FitProblem:
         self._level = [
             losses.level(o.radiance.astype(float) * scale).astype(np.float32) for o in self.views
         ]
-        profiles = list({id(x.profile): 0 for x in self.lights})
-        self.profile_of = np.array([profiles.index(id(x.profile)) for x in self.lights], np.int64)
-
-    def encode(self, maps: HairMaps, lights: LightDeviations) -> Raw:
-        """The unconstrained numbers of `maps` and `lights`."""
-        return encode(maps, lights, self.profile_of)
 
     def patch(self, batch: Batch, pixels: int, rng: np.random.Generator) -> Patch:
         """At most `pixels` random ones of a batch's view, in the order of the image."""
         few = np.sort(rng.permutation(len(self.views[batch.view].pixels))[:pixels])
-        return Patch(batch.view, batch.lights, batch.share, few)
-
-    def gradient(
-        self,
-        raw: Raw,
-        gain: Array,
-        patch: Patch,
-        objective: Objective,
-        effort: Effort,
-        seeds: tuple[int, int],
-    ) -> tuple[Raw, Comparison]:
-        """The loss's derivative by each free number, and the patch rendered beside captured.
-
-        `gain (L,)`; `seeds` are the picture's and the gradient's. Threads would add up a gradient
-        in no fixed order: it takes a single one, and is the same on every run.
-        """
-        leaves = {k: mi.TensorXf(for_kernels(v)) for k, v in raw.items()}
-        for name in objective.free:
-            dr.enable_grad(leaves[name])
-        seen = self.compare(patch, self.render(raw, gain, patch, effort, seeds[0]))
-        difference = seen.rendered - seen.captured
-        weight = losses.gradient(difference, seen.level, seen.valid, objective.error)
-        # a pair's loss is its mean over pixels; losses.gradient took the mean over pairs too
-        weight *= patch.share[:, None, None] * len(patch.lights) * self.scale
-        sampling = ReplaySampling(effort.gradient_spp, effort.max_depth, effort.rr_depth)
-        op = DifferentiableOlat(*self._seen(raw, gain, patch), sampling)
-        values = hair_values(leaves)
-        values |= self._light_values(op, leaves, objective.free, patch.lights)
-        known = op.parameters() | {k: dr.detach(v) for k, v in values.items()}
-        wanted = [k for k, v in values.items() if dr.grad_enabled(v)]
-        with _single_thread():
-            found = op.gradients(known, wanted, mi.TensorXf(for_kernels(weight)), seeds[1])
-            dr.eval(found)
-        total: Any = losses.smoothness(values) if objective.smooth else 0.0
-        for name in wanted:
-            total = total + dr.sum(found[name] * values[name], axis=None)
-        dr.backward(total)
-        return {k: np.array(dr.grad(leaves[k]), float) for k in objective.free}, seen
+        return Patch(batch.view, batch.lights, few)
 
     def error(
         self, raw: Raw, gain: Array, validation: ValidationSet, effort: Effort, seed: int
@@ -173,7 +111,7 @@ class FitProblem:
         parts, counted = [], 0
         for k in views:
             o, lights = self.views[k], np.flatnonzero(used[k])
-            patch = Patch(k, lights, np.ones(len(lights)), np.arange(len(o.pixels)))
+            patch = Patch(k, lights, np.arange(len(o.pixels)))
             halves = np.zeros((len(guesses), 2, len(lights), len(o.pixels), 3))
             for g, (raw, gain) in enumerate(guesses):
                 scene, camera, packed, pixels = self._seen(raw, gain, patch)
@@ -272,22 +210,17 @@ class FitProblem:
 
     def _whole(self, view: int) -> Patch:
         """All pixels of a view under all lights."""
-        lights = np.arange(len(self.lights))
-        return Patch(view, lights, np.ones(len(lights)), np.arange(len(self.views[view].pixels)))
+        lights, pixels = np.arange(len(self.lights)), np.arange(len(self.views[view].pixels))
+        return Patch(view, lights, pixels)
 
-    def deviations(self, raw: Raw, gain: Array) -> LightDeviations:
-        """How `raw` and `gain (L,)` have the lights."""
-        profile = np.exp(raw["profile"])[self.profile_of]
-        return LightDeviations(raw["position"], raw["turn"], gain, profile)
-
-    def spread(self, pairs: Pairs, views: int, images: int) -> list[Batch]:
-        """Some views and lights, spread evenly over what is used."""
-        usable = np.flatnonzero(pairs.used.any(axis=1))
+    def spread(self, used: Bools, views: int, images: int) -> list[Batch]:
+        """At most `views` and `images` lights of each, evenly over the pairs `used (V, L)`."""
+        usable = np.flatnonzero(used.any(axis=1))
         count, out = min(views, len(usable)), []
         for view in usable[[int((i + 0.5) * len(usable) / count) for i in range(count)]]:
-            lights = np.flatnonzero(pairs.used[view])
+            lights = np.flatnonzero(used[view])
             lights = lights[:: max(1, -(-len(lights) // images))]
-            out.append(Batch(int(view), lights, np.ones(len(lights))))
+            out.append(Batch(int(view), lights))
         return out
 
     def _scene_of(self, raw: Raw) -> HairScene:
@@ -302,43 +235,9 @@ class FitProblem:
         self, raw: Raw, gain: Array, patch: Patch
     ) -> tuple[HairScene, Camera, list[Light], Ints]:
         """Scene, camera, lights and pixels of a patch, as `raw` and `gain (L,)` have them."""
-        moved, o = self.deviations(raw, gain).applied(self.lights), self.views[patch.view]
-        return self._scene_of(raw), o.camera, [moved[i] for i in patch.lights], o.pixels[patch.few]
-
-    def _light_values(
-        self,
-        op: DifferentiableOlat,
-        leaves: Mapping[str, Any],
-        free: Sequence[str],
-        lights: Ints,
-    ) -> dict[str, Any]:
-        """The lights of a batch as functions of the leaves; the op's lights are already moved."""
-        out: dict[str, Any] = {}
-        known = op.parameters()
-        rows = (lights[:, None] * 3 + np.arange(3)).ravel()
-        for name, parameter in (("position", "lights.position"), ("turn", "lights.turn")):
-            if name in free:
-                index = mi.UInt32(for_kernels(rows, np.uint32))
-                moved = dr.gather(mi.Float, leaves[name].array, index)
-                moved = moved - dr.detach(moved)
-                out[parameter] = known[parameter] + mi.TensorXf(moved, (len(lights), 3))
-        if "profile" in free:
-            which = np.repeat(self.profile_of[lights], 3).astype(np.uint32)
-            factor = dr.gather(mi.Float, leaves["profile"].array, mi.UInt32(which))
-            factor = dr.exp(factor - dr.detach(factor))
-            intensity = known["lights.intensity"]
-            out["lights.intensity"] = intensity * mi.TensorXf(factor, (len(lights), 3))
-        return out
-
-
-@contextmanager
-def _single_thread() -> Iterator[None]:
-    """Dr.Jit on one thread; no kernel runs while the number of threads changes."""
-    before = dr.thread_count()
-    dr.sync_thread()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.sync_thread()
-        dr.set_thread_count(before)
+        o = self.views[patch.view]
+        lights = [
+            replace(self.lights[i], intensity=self.lights[i].intensity * gain[i])
+            for i in patch.lights
+        ]
+        return self._scene_of(raw), o.camera, lights, o.pixels[patch.few]

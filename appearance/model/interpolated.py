@@ -193,7 +193,7 @@ class GuidedFrames:
             _directions(np.array([x.position for x in many]) - middle)
             for many in ([capture.rig.light(n) for n in shot], lights)
         )
-        order, weights = light_weights(captured, new, kriged=False)
+        order, weights = light_weights(captured, new)
         total = np.zeros((int(mask.sum()), 3), np.float32)
         for k, light in enumerate(lights):
             names = [shot[j] for j in order[k]]
@@ -266,17 +266,6 @@ def environment_lights(environment: Environment, rows: int = ROWS) -> list[Light
         for c in cells[1]
         for light in _far(f"cell_{r[0]}_{c[0]}", *(x[np.ix_(r, c)] for x in lit))
     ]
-
-
-def brightest_direction(environment: Environment) -> list[Light]:
-    """All of a map's light from where it is brightest, as GroomLight evaluates its residual."""
-    weight, colour, direction = _texels(environment)
-    k = np.unravel_index(
-        int(np.where(weight > 0, colour.sum(-1) / np.maximum(weight, 1e-30), 0).argmax()),
-        weight.shape,
-    )
-    total = colour.sum(axis=(0, 1))[None, None]
-    return _far("brightest", weight[k][None, None], total, direction[k][None, None])
 
 
 def _texels(environment: Environment) -> tuple[Array, Array, Array]:

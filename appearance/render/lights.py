@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.bsdf.shading_frame import rodrigues
 from appearance.render.environment_maps import BRIGHTEST
 from appearance.scene.hair_scene import SCALE, light_arrays
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
@@ -27,9 +26,7 @@ class PackedLights:
 
     `positions`, `intensities (3 L,)` are there always. `orientations (9 L,)`, `radii (L,)`,
     `sizes (2 L,)` are there where some light has one; a light without a size has sizes of 0.
-    `profiles` are the distinct ones, `profile_of (L,)` counts them from 1, 0 for none. `turns
-    (3 L,)` turns a light about its centre, axis-angle in the world's frame; only gradients need it.
-    All may be differentiated.
+    `profiles` are the distinct ones, `profile_of (L,)` counts them from 1, 0 for none.
     """
 
     count: int
@@ -40,7 +37,6 @@ class PackedLights:
     sizes: Any | None = None
     profiles: tuple[ProfileTable, ...] = ()
     profile_of: Any | None = None
-    turns: Any | None = None
 
     @classmethod
     def of(cls, lights: Sequence[Light], weights: ArrayLike = 1.0) -> PackedLights:
@@ -95,19 +91,15 @@ class PackedLights:
         if self.orientations is None:
             return target, intensity
         frame: Any = dr.gather(mi.Matrix3f, self.orientations, light, active)
-        turn = None
-        if self.turns is not None:
-            turn = dr.gather(mi.Vector3f, self.turns, light, active)
         flat: Any = mi.Bool(False)
         if self.sizes is not None:
             size = dr.gather(mi.Vector2f, self.sizes, light, active)
             flat = size.x > 0
             across = mi.Vector3f(size.x * (u - 0.5), size.y * (v - 0.5), 0)
-            offset = frame.T @ across
-            target = target + (offset if turn is None else rodrigues(turn, offset))
+            target = target + frame.T @ across
         # a rectangle shines from each of its points, all others from their middle
         away = p - (target if self.radii is None else dr.select(flat, target, centre))
-        local = frame @ (away if turn is None else rodrigues(-turn, away))
+        local = frame @ away
         share: Any = mi.Float(1)
         if self.sizes is not None:
             ahead = dr.maximum(local.z, 0) * dr.rsqrt(dr.squared_norm(local))

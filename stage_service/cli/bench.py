@@ -23,7 +23,6 @@ BENCHMARKS = {
     "exports": "a model opened, rendered and written by Blender, beside ours",
     "fields": "fields of reflectance beside baselines on new lights and views; their solver",
     "frames": "the simulators' frames beside many paths: error against run time",
-    "gradients": "path replay beside finite differences",
     "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
     "large": "captures of 1.3 and 20 megapixels: seconds and memory beside their estimate",

@@ -32,7 +32,6 @@ MODULES = {
     "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
-    "gradients": "benchmarks.renderers.gradients",
     "importing": "benchmarks.importing.damages",
     "interpolation": "benchmarks.fields.interpolation",
     "large": "benchmarks.importing.large_sizes",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -84,46 +83,3 @@ def test_a_capture_becomes_relit_hair(running, captured, finished):
     assert running.verify(Path(captured["path"])) == []
     assert len(list(Path(captured["path"]).glob("frames/*/*.zip.exr"))) == running.FRAMES
     assert len(running.get("/devices")["cameras"]) == running.CAMERAS
-
-
-@pytest.mark.slow  # a killed worker and a killed fit each have a smaller test
-def test_inverse_rendering_goes_on_where_its_worker_was_killed(running, captured, finished):
-    effort = {"pixels": 60, "spp": 4, "gradient_spp": 2}
-    fit = {"variant": "lights", "shape": [2, 2, 2], "steps": 40, "check_every": 5}
-    asked = {
-        "capture": captured["id"],
-        "model": Path(finished[0]["model"]).name,
-        "pipeline": {
-            "name": "appearance",
-            "options": {
-                **HELD_OUT,
-                "fit": {"iterations": 2},
-                "inverse_rendering": {
-                    "judged_spp": 4,
-                    "max_depth": 4,
-                    "fit": fit | {"halvings": 99, "effort": effort},
-                },
-                "assess": {"relit_size": 32, "relit_spp": 4},
-            },
-        },
-    }
-    path = f"/jobs/{running.post('/jobs', asked)['id']}"
-
-    def step() -> int:
-        """The step of the fit that the job tells, with its current error; 0 before the volume's."""
-        progress = running.get(path)["progress"] or {"what": "", "step_share": 0.0}
-        told = re.match(r"step (\d+): error \d", progress["what"])
-        return int(told[1]) if told and progress["step_share"] > 0.3 else 0
-
-    reached = running.until(lambda: (n := step()) >= 10 and n, 200)
-    running.workers[-1].kill()
-    running.workers[-1].wait()
-    running.work()
-    running.until(lambda: step() == 0, 100)  # until then, what the killed worker had told
-    assert running.until(step, 100) >= reached
-    running.until(lambda: running.get(path)["state"] == "done", 300)
-    job = running.get(path)
-    assert (job["outcome"], job["error"]) == ("succeeded", None)
-    # by name: what validation speaks against lies in a folder of its own
-    found = {Path(a["path"]).name for a in running.get(f"{path}/artifacts")}
-    assert {"hair_maps.npz", "lights.json", "report.json"} <= found

@@ -14,7 +14,7 @@ from appearance.fields.kajiya_kay import KajiyaKay
 from appearance.fields.neighbours import camera_weights, light_weights
 from appearance.fields.reflectance import CapturedView, ReflectanceField
 from appearance.fields.search import DIFFUSE, EXPONENT, blocks, refined, searched, worst_block
-from appearance.model.interpolated import brightest_direction, environment_lights, panel
+from appearance.model.interpolated import environment_lights, panel
 from appearance.render.environment_maps import studio
 from appearance.render.mixed import Environment
 from appearance.scene.hair_appearance import HairAppearance
@@ -97,12 +97,11 @@ def test_the_true_model_reproduces_its_own_frames_and_standard_interpolation_doe
 
 def test_a_captured_light_is_reproduced_from_a_captured_camera(planted):
     hits = planted.sources[0].hits
-    for kriged in (True, False):
-        for model in (None, KajiyaKay(0.1, 30.0)):
-            one = replace(planted, model=model, kriged=kriged)
-            made, _ = one.seen_by(hits).under([one.field.lights[17]])
-            table = one.sources[0].view.table[17].astype(float)
-            np.testing.assert_allclose(made[0], table, rtol=4e-3, atol=1e-3 * table.max())
+    for model in (None, KajiyaKay(0.1, 30.0)):
+        one = replace(planted, model=model)
+        made, _ = one.seen_by(hits).under([one.field.lights[17]])
+        table = one.sources[0].view.table[17].astype(float)
+        np.testing.assert_allclose(made[0], table, rtol=4e-3, atol=1e-3 * table.max())
 
 
 def test_twice_as_far_or_twice_as_bright(planted):
@@ -338,11 +337,10 @@ class TestNeighbours:
         np.testing.assert_allclose(camera_weights(two[:1], np.array([0, 0, 1.0])), [1])
         np.testing.assert_allclose(camera_weights(two, unit(np.array([1.0, 1, 0]))), [0.5, 0.5])
 
-    @pytest.mark.parametrize("kriged", [True, False])
-    def test_equal_lights_share_and_rows_sum_to_one(self, kriged):
+    def test_equal_lights_share_and_rows_sum_to_one(self):
         directions = unit(dome_positions(20, 1.0))
         both = np.concatenate([directions, directions[:1]])
-        order, weights = light_weights(both, directions[:1], kriged=kriged)
+        order, weights = light_weights(both, directions[:1])
         found = np.zeros(21)
         found[order[0]] = weights[0]
         assert found[0] == pytest.approx(0.5, abs=1e-3)
@@ -351,9 +349,8 @@ class TestNeighbours:
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
         assert (weights >= 0).all()
 
-    @pytest.mark.parametrize("kriged", [True, False])
-    def test_one_light_alone(self, kriged):
-        _, weights = light_weights(np.eye(3)[:1], unit(np.ones((1, 3))), kriged=kriged)
+    def test_one_light_alone(self):
+        _, weights = light_weights(np.eye(3)[:1], unit(np.ones((1, 3))))
         np.testing.assert_allclose(weights, [[1]], rtol=1e-6)
 
 
@@ -386,16 +383,6 @@ class TestEnvironments:
         whole, _ = view.under_all(lights)
         single = sum(view.under([x])[0][0] for x in lights)
         np.testing.assert_allclose(whole, single, rtol=1e-4)
-
-    def test_the_brightest_direction_has_all_the_light(self):
-        envmap = np.full((16, 32, 3), 0.1, np.float32)
-        envmap[4, 8] = 50.0
-        (light,) = brightest_direction(Environment(envmap))
-        every = environment_lights(Environment(envmap))
-        total = sum(irradiance(x, np.zeros((1, 3))) for x in every)
-        np.testing.assert_allclose(irradiance(light, np.zeros((1, 3))), total, rtol=1e-4)
-        z = np.cos(np.pi * 4.5 / 16)
-        assert unit(light.position)[2] == pytest.approx(z, abs=1e-6)
 
     def test_a_panel_keeps_its_light(self):
         aim = np.eye(3)

@@ -18,7 +18,7 @@ from reconstruction import Camera, Light
 TRUTH = HairAppearance((0.06, 0.12, 0.3), 0.25, 0.35)
 SKIN = np.full(3, 0.3)
 DEPTH = 6
-QUICK = Effort(pixels=100, spp=16, gradient_spp=4, max_depth=DEPTH)
+QUICK = Effort(pixels=100, spp=16, max_depth=DEPTH)
 
 
 def dome(count: int, distance: float = 1.0) -> tuple[Light, ...]:

@@ -9,7 +9,7 @@ from reconstruction.files import durable
 
 def state(value: float) -> State:
     raw = {"beta_m": np.array([value])}
-    return State(raw, raw, raw, tables={"gain": np.ones(2)})
+    return State(raw, np.ones(2))
 
 
 def test_a_state_is_on_the_disk_before_it_replaces_the_one_before_it(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.correctives import solve_correctives
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.unknowns import LightDeviations, decode
+from appearance.inverse_rendering.unknowns import decode, encode
 
 EFFORT = Effort(pixels=100, spp=64, max_depth=6)
 TURN = np.array([0.15, -0.1])
@@ -20,7 +20,7 @@ def solve(tufted, truth: HairMaps, **more):
     """The start, and what is found from five draws of the paths: single ones are 0.06 off."""
     problem = tufted.problem(truth, spp=1024)
     start = replace(truth, rotation=np.zeros_like(truth.rotation))
-    raw = problem.encode(start, LightDeviations.calibrated(len(problem.lights)))
+    raw = encode(start)
     gain = np.ones(len(problem.lights))
     draws = range(0, 5000, 1000)
     return raw, [solve_correctives(problem, raw, gain, EFFORT, seed=s, **more) for s in draws]
@@ -54,7 +54,7 @@ def test_neighbours_are_held_together_by_their_weight(tufted, shape, lambda_r, a
 
 def test_without_lights_to_judge_by_nothing_is_turned(tufted):
     problem = tufted.problem(lights=tufted.dome(3))
-    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(3))
+    raw = encode(HairMaps.of(tufted.truth))
     found = solve_correctives(problem, raw, np.ones(3), EFFORT)
     assert found.raw is raw
     assert found.taken == ()

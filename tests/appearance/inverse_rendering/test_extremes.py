@@ -9,18 +9,14 @@ import pytest
 
 from appearance import HairAppearance, InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.loop import run
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.problem import FitProblem, Objective
-from appearance.inverse_rendering.unknowns import LightDeviations
+from appearance.inverse_rendering.problem import FitProblem
 
 START = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
-FEW = Effort(pixels=40, spp=4, gradient_spp=2, max_depth=5)
-OPTIONS = InverseRenderingOptions(
-    variant="original", steps=4, check_every=2, validation_views=1, effort=FEW
-)
-ENOUGH = replace(OPTIONS, effort=Effort(pixels=80, spp=16, gradient_spp=4, max_depth=5))
+FEW = Effort(pixels=40, spp=4, max_depth=5)
+OPTIONS = InverseRenderingOptions(variant="original", effort=FEW)
+ENOUGH = replace(OPTIONS, effort=Effort(pixels=80, spp=16, max_depth=5))
 
 
 def check(
@@ -76,30 +72,6 @@ def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufte
     assert off(check(cut, HairMaps.of(START), ENOUGH), tufted.truth) < 0.4
 
 
-def test_a_cell_that_no_ray_meets_stays_and_turns_no_more_than_its_neighbours(tufted, plain):
-    # the cells beyond the last strand's column hold no strand
-    uv = tufted.mapped.root_uv * [0.4, 1.0]
-    mapped = type(tufted.mapped).of(tufted.scene, tufted.strands, uv)
-    problem = FitProblem(mapped, plain.views, plain.scale, plain.skin)
-    start = HairMaps.of(START, (2, 2, 1))
-    options = replace(OPTIONS, variant="correctives", shape=(2, 2, 1), steps=6)
-    found = run(problem, start, options=options).maps
-    np.testing.assert_allclose(found.sigma_a[:, 1], START.sigma_a[0], rtol=1e-3)
-    met, unmet = (np.abs(found.rotation[:, k]).max() for k in (0, 1))
-    assert unmet <= met + 1e-6
-
-
-def test_gradients_at_no_rotation_are_finite_and_not_all_zero(plain):
-    raw = plain.encode(HairMaps.of(START, (2, 2, 2)), LightDeviations.calibrated(8))
-    batch = Batch(0, np.arange(8), np.ones(8) / 8)
-    patch = plain.patch(batch, FEW.pixels, np.random.default_rng(0))
-    objective = Objective(("rotation", "position", "turn", "profile"), smooth=True)
-    gradient, _ = plain.gradient(raw, np.ones(8), patch, objective, FEW, (1, 2))
-    assert all(np.isfinite(g).all() for g in gradient.values())
-    assert np.abs(gradient["rotation"]).max() > 0
-    assert np.abs(gradient["position"]).max() > 0
-
-
 def test_lights_at_a_third_of_the_distance(tufted):
     near = tufted.problem(views=1, lights=tufted.dome(8, 0.33))
     quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=32))
@@ -120,7 +92,7 @@ def test_frames_that_are_all_saturated_end_the_fit_at_once_with_the_reason(plain
     ]
     start = HairMaps.of(START)
     found = run(FitProblem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
-    assert (found.ended, found.steps) == ("no pair of camera and light shows lit hair", 0)
+    assert found.ended == "no pair of camera and light shows lit hair"
     assert found.maps is start
 
 
@@ -128,5 +100,5 @@ def test_black_frames_end_the_fit_at_once_with_the_reason(plain):
     views = [replace(o, radiance=np.zeros_like(o.radiance)) for o in plain.views]
     start = HairMaps.of(START)
     found = run(FitProblem(plain.mapped, views, 1.0, plain.skin), start, options=OPTIONS)
-    assert (found.ended, found.steps) == ("no pair of camera and light shows lit hair", 0)
+    assert found.ended == "no pair of camera and light shows lit hair"
     assert found.maps is start

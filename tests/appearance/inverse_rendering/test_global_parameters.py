@@ -9,19 +9,19 @@ import pytest
 
 from appearance import HairAppearance
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.batches import Batch, Pairs
+from appearance.inverse_rendering.batches import Batch, lit_pairs
 from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import LightDeviations, decode
+from appearance.inverse_rendering.unknowns import decode, encode
 
 COLOUR = ("sigma_a", "beta_m", "beta_n", "eta")
 EFFORT = Effort(pixels=100, spp=64, max_depth=6)
 
 
 def solve(problem: FitProblem, hair: HairAppearance, names=COLOUR, effort: Effort = EFFORT):
-    raw = problem.encode(HairMaps.of(hair), LightDeviations.calibrated(len(problem.lights)))
-    pairs = problem.spread(Pairs(problem.views, problem.scale), 2, 8)
+    raw = encode(HairMaps.of(hair))
+    pairs = problem.spread(lit_pairs(problem.views, problem.scale), 2, 8)
     found, gain, left_open = solve_global_parameters(
         problem, raw, np.ones(len(problem.lights)), names, Evidence(pairs, effort, 3)
     )
@@ -105,8 +105,8 @@ def test_lights_that_no_picture_is_of_stay_calibrated(plain, tufted):
     for o in stronger:
         o.radiance[0] *= 1.2
     problem = FitProblem(plain.mapped, stronger, plain.scale, plain.skin)
-    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
-    pairs = [Batch(view, np.array([0, 2, 4, 6]), np.ones(4)) for view in (0, 1)]
+    raw = encode(HairMaps.of(tufted.truth))
+    pairs = [Batch(view, np.array([0, 2, 4, 6])) for view in (0, 1)]
     _, gain, _ = solve_global_parameters(
         problem, raw, np.ones(8), ("gain",), Evidence(pairs, replace(EFFORT, spp=16))
     )
@@ -131,8 +131,8 @@ def test_the_same_seed_gives_the_same_numbers(plain, tufted):
 def test_what_no_pixel_tells_stays(plain, tufted):
     views = [replace(o, valid=np.zeros_like(o.valid)) for o in plain.views]
     problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
-    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
-    pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
+    raw = encode(HairMaps.of(tufted.truth))
+    pairs = plain.spread(lit_pairs(plain.views, plain.scale), 2, 8)
     found, gain, left_open = solve_global_parameters(
         problem, raw, np.ones(8), COLOUR, Evidence(pairs, replace(EFFORT, spp=8))
     )
@@ -145,8 +145,8 @@ def test_what_no_pixel_tells_stays(plain, tufted):
 def test_a_frame_that_is_not_a_number_changes_nothing(plain, tufted):
     views = [replace(o, radiance=np.full_like(o.radiance, np.nan)) for o in plain.views]
     problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
-    raw = problem.encode(HairMaps.of(tufted.truth), LightDeviations.calibrated(8))
-    pairs = plain.spread(Pairs(plain.views, plain.scale), 2, 8)
+    raw = encode(HairMaps.of(tufted.truth))
+    pairs = plain.spread(lit_pairs(plain.views, plain.scale), 2, 8)
     found, _, _ = solve_global_parameters(
         problem, raw, np.ones(8), COLOUR, Evidence(pairs, replace(EFFORT, spp=8))
     )

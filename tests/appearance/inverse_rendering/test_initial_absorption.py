@@ -12,7 +12,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import initial_absorption
 from appearance.inverse_rendering.initial_absorption import absorption_of_cells
 from appearance.inverse_rendering.options import Effort
-from appearance.inverse_rendering.unknowns import BRACKET, LightDeviations, decode, encode
+from appearance.inverse_rendering.unknowns import BRACKET, decode, encode
 
 SHAPE = (6, 8, 8)
 NOISE = 0.3
@@ -39,7 +39,7 @@ def problem(monkeypatch):
 def test_noise_of_rounds_averages_out(problem):
     """Nine of twelve rounds count as their mean: half of the noise, as neighbours share theirs."""
     start = HairMaps.of(HairAppearance((0.01, 0.1, 0.1), 0.3, 0.3), SHAPE)
-    raw = encode(start, LightDeviations.calibrated(1), np.zeros(1, int))
+    raw = encode(start)
     spread = []
     for whole in (12, 4):
         maps = absorption_of_cells(problem, raw, np.ones(1), Effort(), whole=whole)

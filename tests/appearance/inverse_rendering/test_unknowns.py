@@ -1,22 +1,16 @@
-"""Unconstrained numbers stand for the values that they were made from, and have derivatives."""
+"""Unconstrained numbers decode to the maps that they encode, and their derivatives are right."""
 
 from __future__ import annotations
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from appearance import HairAppearance
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import losses
-from appearance.inverse_rendering.unknowns import LightDeviations, decode, encode, hair_values
+from appearance.inverse_rendering.unknowns import decode, encode, slopes
 from appearance.metrics.scores import srgb
-from appearance.scene.backend import ensure_backend
-from reconstruction import Light, Model, ModelError
-from reconstruction.geometry.cameras import facing
-
-NONE = np.zeros(2, np.int64)
+from reconstruction import Model, ModelError
 
 
 def maps(sigma_a=(0.1, 0.2, 0.4), beta=0.3, shape=(3, 2, 2)):
@@ -34,48 +28,16 @@ def maps(sigma_a=(0.1, 0.2, 0.4), beta=0.3, shape=(3, 2, 2)):
 @pytest.mark.parametrize("beta", [0.02, 0.3, 0.9])
 def test_black_white_sharp_and_rough_hair_survive_the_way_there_and_back(sigma_a, beta):
     wanted = maps(sigma_a, beta)
-    raw = encode(wanted, LightDeviations.calibrated(2), NONE)
+    raw = encode(wanted)
     found = decode(raw)
     np.testing.assert_allclose(found.sigma_a, wanted.sigma_a, rtol=1e-3)
     np.testing.assert_allclose(found.rotation, wanted.rotation, atol=1e-9)
     assert (found.beta_m, found.eta) == (pytest.approx(beta), pytest.approx(1.55))
     assert found.tilt_deg == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("sigma_a", [(8.0, 12.0, 20.0), (1e-4, 5e-4, 2e-3)])
-def test_derivatives_are_finite_also_at_no_rotation_and_at_both_ends_of_absorption(sigma_a):
-    ensure_backend()
-    raw = encode(
-        HairMaps.of(HairAppearance(sigma_a, 0.02, 0.9), (3, 2, 2)),
-        LightDeviations.calibrated(2),
-        NONE,
-    )
-    leaves = {k: mi.TensorXf(v.astype(np.float32)) for k, v in raw.items()}
-    for name in ("sigma_a", "rotation", "beta_m", "beta_n", "eta", "tilt_deg"):
-        dr.enable_grad(leaves[name])
-    values = hair_values(leaves)
-    total = losses.smoothness(values)
-    for value in values.values():
-        total = total + dr.sum(value, axis=None)
-    np.testing.assert_allclose(np.array(values["hair.sigma_a"])[0, 0, 0], sigma_a, rtol=2e-3)
-    dr.backward(total)
-    for name, leaf in leaves.items():
-        assert np.isfinite(np.array(dr.grad(leaf))).all(), name
-
-
-def test_smoothness_is_a_mean_over_layers_cells_and_channels():
-    ensure_backend()
-
-    def value(columns):
-        sigma_a = np.zeros((3, columns, 2, 3), np.float32)
-        sigma_a[1:] = 0.4
-        table = mi.TensorXf(sigma_a)
-        dr.enable_grad(table)
-        values = {"hair.sigma_a": table, "hair.rotation": mi.TensorXf(np.zeros((3, 1, 1, 2)))}
-        return float(np.array(losses.smoothness(values)).ravel()[0])
-
-    assert value(1) == pytest.approx(0.5 * 0.2, rel=0.01)
-    assert value(8) == pytest.approx(value(1))
+    for name, slope in slopes(raw).items():
+        up, down = (decode(raw | {name: raw[name] + step}) for step in (1e-4, -1e-4))
+        change = (np.asarray(getattr(up, name)) - getattr(down, name)) / 2e-4
+        np.testing.assert_allclose(np.broadcast_to(slope, change.shape), change, rtol=1e-5)
 
 
 def test_squares_have_no_noise_of_two_renderings_in_them():
@@ -88,32 +50,16 @@ def test_squares_have_no_noise_of_two_renderings_in_them():
         expected, rel=0.2
     )
     valid[1] = False
-    assert (losses.gradient(one, level, valid, 1.0)[1] == 0).all()
     assert losses.squares(one, other, level, np.zeros_like(valid)) == 0.0
 
 
-def test_the_loss_is_of_differences_as_they_are_displayed_and_proportional_to_them():
+def test_the_loss_is_of_differences_as_they_are_displayed():
     level = np.array([[[0.05, 0.2, 0.8]]])
     valid = np.ones((1, 1), bool)
     step = 0.01 * level
     shown = srgb(level + step) - srgb(level)
     squares = losses.squares(step, step, losses.weights(level), valid)
     assert squares == pytest.approx((shown**2).mean(), rel=0.4)
-    once, twice = (losses.gradient(k * step, level, valid, k * k * 0.01) for k in (1.0, 2.0))
-    np.testing.assert_allclose(once, twice)
-
-
-def test_lights_move_turn_and_brighten_about_their_calibration():
-    aimed = Light("a", (0, 0, 1), np.ones(3), orientation=facing((0, 0, -1)), size=(0.1, 0.1))
-    moved = LightDeviations(
-        np.array([[0.01, 0, 0]]), np.array([[np.pi / 2, 0, 0]]), np.array([1.1]), np.array([2.0])
-    )
-    (found,) = moved.applied([aimed])
-    np.testing.assert_allclose(found.position, (0.01, 0, 1))
-    np.testing.assert_allclose(found.intensity, 2.2)
-    assert found.orientation is not None
-    # its aim, downwards, turned about x by the right-hand rule
-    np.testing.assert_allclose(found.orientation[2], (0, 1, 0), atol=1e-12)
 
 
 def test_resizing_keeps_what_is_linear_along_the_strand_and_flat_on_the_scalp():

@@ -7,7 +7,6 @@ from appearance import Exposure, FittedModel, HairAppearance, HeldOut, InverseRe
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import pipeline
 from appearance.inverse_rendering.found_lights import save_lights
-from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.model import validated
 from appearance.model.validated import far_apart, fit_validated
 from appearance.sun_fit.fitted_appearance import FittedAppearance
@@ -63,9 +62,7 @@ def fit_that_scores(psnr: float, seen: list[tuple[set[str], set[str]]]):
         seen.append(({c.name for c in training.rig.cameras}, set(training.olat_lights())))
         FOUND.save(model, np.array([[0.5, 0.5]]))
         lights = [capture.rig.light(n) for n in training.olat_lights()]
-        twice = LightDeviations.calibrated(len(lights))
-        twice.gain[:] = 2
-        save_lights(model, twice, lights)
+        save_lights(model, np.full(len(lights), 2.0), lights)
         report = Report()
         with report.stage("inverse_rendering"):
             pass

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,9 @@ import numpy as np
 
 from appearance import InverseRenderingOptions
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.loop import Monitor, run
+from appearance.inverse_rendering.loop import run
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.observations import Observed
 from benchmarks.appearance.cycles import AFAR, CyclesFrames, captured_by_cycles, fit_cycles
 from benchmarks.appearance.cycles import OPTIONS as CYCLES_OPTIONS
 from benchmarks.appearance.known_subjects import (
@@ -41,10 +40,8 @@ from reconstruction.arrays import Array
 OPTIONS = InverseRenderingOptions(
     variant="lights",
     free_index=True,
-    steps=30,
-    check_every=30,
     shape=(6, 24, 24),
-    effort=Effort(pixels=400, spp=512, gradient_spp=64, max_depth=8),
+    effort=Effort(pixels=400, spp=512, max_depth=8),
 )
 STAGE = SmallStage(size=36, cameras=5, lights=12, spp=12288, judged_spp=1536)
 AT_SIZE = {
@@ -60,9 +57,7 @@ AT_SIZE = {
     for size, views, lights in ((128, 8, 24), (256, 16, 64))
 }
 """By pixels a side: 8 training views and 24 lights, 16 and 64; the truth is finer than the fit."""
-AT_SIZE_OPTIONS = replace(
-    OPTIONS, shape=(12, 24, 24), steps=10, effort=Effort(pixels=600, spp=64, gradient_spp=16)
-)
+AT_SIZE_OPTIONS = replace(OPTIONS, shape=(12, 24, 24), effort=Effort(pixels=600, spp=64))
 STARTS = (
     (0.4, 0.2, 1.45, (0.75, 1.25, 1.3)),
     (0.9, 0.9, 1.55, (1.0, 1.0, 1.0)),
@@ -85,10 +80,6 @@ class Ladders:
     capture: Path | None = None
 
 
-PLAIN = Effort(pixels=600, spp=16, gradient_spp=16)
-"""Paths of the plain version: as many for the picture as for its gradient."""
-
-
 def run_bench(
     out: Path,
     subject: Subject,
@@ -99,7 +90,7 @@ def run_bench(
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The table of every subject; recovery, also from afar, on (a); error against time on (b).
+    """The table of every subject; recovery, also from afar, on (a).
 
     The variants up to "spatial" of (b) for all `seeds`, with their spread. Writes what there is so
     far into `out`, and returns what `appearance.json` holds.
@@ -126,7 +117,6 @@ def run_bench(
             shared = [n for n in found[0] if all(n in f for f in found)]
             result["seeds"] = {name: {n: spread([f[n] for f in found]) for n in shared}}
             _write(out, result)
-            result["time"] = error_against_time(captured, options, progress, seed)
         _write(out, result)
     return result
 
@@ -219,7 +209,7 @@ def recovery(
     true = np.array([lights[i].intensity[0] for i in captured.train_lights])
     known = np.array([off[i].intensity[0] for i in captured.train_lights])
     out[name]["original"]["lights_off"] = _relative_spread(known / true)
-    out[name]["lights"]["lights_off"] = _relative_spread(known * table.found[1].gain / true)
+    out[name]["lights"]["lights_off"] = _relative_spread(known * table.found[1] / true)
     return out
 
 
@@ -266,74 +256,6 @@ def _recovered(variants: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]
 def _relative_spread(ratio: Array) -> float:
     """RMS of what lights differ by from each other: all of them together is the hair's colour."""
     return float(np.std(ratio / ratio.mean()))
-
-
-def error_against_time(
-    captured: Captured, options: InverseRenderingOptions, progress: Progress = silent, seed: int = 0
-) -> dict[str, list[dict[str, float]]]:
-    """Held-out PSNR of "spatial" against CPU seconds: ours, by steps alone, and those undone.
-
-    "steps" begins with the cells' colours and descends from there; the next three are that with one
-    choice undone. "plain" draws pairs evenly, renders whole frames one at a time to a fixed number
-    of bounces, as many paths for a picture as for its gradient, and starts from one colour.
-    Validation is not counted.
-    """
-    training = captured.training()
-    scale, skin = captured.exposure.scale, captured.skin
-    ours = replace(options, variant="spatial", check_every=max(2, options.steps // 3))
-    steps = replace(ours, gauss_newton=False)
-    frame = captured.views[0].camera.width * captured.views[0].camera.height
-    depth = options.effort.max_depth
-    versions = {
-        "ours": ours,
-        "steps": steps,
-        "steps, one colour first": replace(steps, cell_start=False),
-        "steps, common numbers": replace(steps, common_numbers=True),
-        "steps, even batches": replace(steps, residual_weighted=False),
-        "plain": replace(
-            steps,
-            effort=replace(PLAIN, pixels=frame, max_depth=depth, rr_depth=depth),
-            levels=1,
-            residual_weighted=False,
-            cell_start=False,
-            shared_paths=False,
-        ),
-    }
-    start = HairMaps.of(replace(captured.truth.mean(), sigma_a=(0.3, 0.3, 0.3), beta_m=0.4))
-    curves = {}
-    for name, version in versions.items():
-        progress(f"time: {name}", 0.0)
-        views = [_framed(o) for o in training] if name == "plain" else training
-        points: list[tuple[float, HairMaps]] = []
-        problem = FitProblem(captured.mapped, views, scale, skin)
-        run(
-            problem,
-            start,
-            options=version,
-            monitor=Monitor(snapshot=_into(points)),
-            seed=seed,
-        )
-        table = Table(captured, options, seed=seed)
-        curve = []
-        for seconds, maps in points:
-            table.score_maps("now", maps, captured.mapped, seconds)
-            psnr_clean = table.variants["now"][GROUPS[1]]["psnr_clean"]
-            curve.append({"cpu_seconds": seconds, "psnr_clean": psnr_clean})
-        curves[name] = curve
-    return curves
-
-
-def _framed(o: Observed) -> Observed:
-    """All pixels of the camera, of which those beside the hair do not count."""
-    pixels = np.arange(o.camera.width * o.camera.height)
-    radiance = np.zeros((len(o.lights), len(pixels), 3), np.float32)
-    valid = np.zeros(radiance.shape[:2], bool)
-    radiance[:, o.pixels], valid[:, o.pixels] = o.radiance, o.valid
-    return Observed(o.camera, o.lights, pixels, radiance, valid)
-
-
-def _into(points: list[tuple[float, HairMaps]]) -> Callable[[float, HairMaps], None]:
-    return lambda seconds, maps: points.append((seconds, maps))
 
 
 def _final(variants: dict[str, dict[str, Any]]) -> dict[str, float]:
@@ -386,9 +308,6 @@ def report(result: dict[str, Any]) -> str:
             f"- from β_M {start['beta_m']:g}, β_N {start['beta_n']:g}, η {start['eta']:g}: "
             f"{_off(variant)}, η {variant['eta']:.3f}, {variant['cpu_seconds']:.0f} CPU s"
         )
-    for name, curve in result.get("time", {}).items():
-        points = ", ".join(f"{p['cpu_seconds']:.0f} s: {p['psnr_clean']:.2f}" for p in curve)
-        lines.append(f"- {name}: {points}")
     return "\n".join(lines) + "\n"
 
 
@@ -401,10 +320,8 @@ def _off(found: dict[str, Any]) -> str:
 QUICK = InverseRenderingOptions(
     variant="lights",
     free_index=True,
-    steps=2,
-    check_every=2,
     shape=(2, 2, 2),
-    effort=Effort(pixels=40, spp=4, gradient_spp=2, max_depth=4),
+    effort=Effort(pixels=40, spp=4, max_depth=4),
 )
 SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 

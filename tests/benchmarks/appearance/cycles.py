@@ -37,8 +37,7 @@ HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = InverseRenderingOptions(
     variant="original",
     free_index=True,
-    validation_views=6,
-    effort=Effort(pixels=300, spp=384, gradient_spp=48, max_depth=12),
+    effort=Effort(pixels=300, spp=384, max_depth=12),
 )
 _PIXELS = 1500
 AFAR = HairAppearance((0.13, 0.15, 0.35), 0.42, 0.2)
@@ -167,7 +166,6 @@ def fit_cycles(
     return {
         "psnr_held_out": scores,
         "ended": found.ended,
-        "steps": found.steps,
         "skin": albedo.tolist(),
         "warnings": stage.warnings,
         "start": _against(start, frames.truth),

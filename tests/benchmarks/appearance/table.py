@@ -15,7 +15,6 @@ from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
 from appearance.inverse_rendering.memory import Sizes, memory_needed
 from appearance.inverse_rendering.options import Variant
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import LightDeviations
 from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.sun_fit.options import FitOptions
@@ -80,7 +79,7 @@ class Table:
         maps = HairMaps.of(hair)
         self.score_maps("HairInverse", maps, captured.mapped, time.perf_counter() - begun)
         self.variants["HairInverse"]["warnings"] = stage.warnings
-        lights = None
+        gain = None
         problem = FitProblem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
         sizes = Sizes([len(o.pixels) for o in self.training], len(self.training[0].lights))
         for variant in variants:
@@ -93,25 +92,24 @@ class Table:
                 found = run(
                     problem,
                     maps,
-                    lights,
+                    gain,
                     options=options,
                     seed=self.seed,
                     monitor=Monitor(within(self.progress, f"({variant})")),
                 )
             worked = time.process_time() - worked
-            maps, lights = found.maps, found.lights
+            maps, gain = found.maps, found.gain
             self.score_maps(variant, maps, captured.mapped, time.perf_counter() - begun)
             self.variants[variant] |= {
                 "cpu_seconds": worked,
                 "memory_gb": peak.gb,
                 "memory_told_gb": held + memory_needed(sizes, options),
                 "ended": found.ended,
-                "steps": found.steps,
-                "gain_spread": float(found.lights.gain.std()),
+                "gain_spread": float(found.gain.std()),
                 "history": found.history,
             }
         self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
-        self.found = maps, lights or LightDeviations.calibrated(len(self.training[0].lights))
+        self.found = maps, np.ones(len(self.training[0].lights)) if gain is None else gain
         return self.variants
 
     def _truth(self) -> list[tuple[int, int]]:

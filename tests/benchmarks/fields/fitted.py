@@ -38,7 +38,7 @@ STAGE = SmallStage(size=24, cameras=8, lights=18, spp=576, judged_spp=576, truth
 CYCLES_PATHS = 96
 """Paths a pixel of Cycles' many pixels."""
 OPTIONS = InverseRenderingOptions(
-    variant="spatial", steps=10, effort=Effort(pixels=300, spp=256, gradient_spp=32, max_depth=10)
+    variant="spatial", effort=Effort(pixels=300, spp=256, max_depth=10)
 )
 
 

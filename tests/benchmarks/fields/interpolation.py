@@ -128,14 +128,10 @@ def variants(shot: Captured, progress: Progress) -> tuple[dict[str, Interpolatio
     search = searched(standard, names[5 :: max(len(names) // 4, 1)], cameras=1, progress=progress)
     search.tell(stage)
     guided = replace(standard, model=search.best)
-    kriged = replace(guided, kriged=True)
     return {
         "standard, radial (Photobooth §4.1)": standard,
-        "standard, kriged": replace(standard, kriged=True),
         "Kajiya-Kay, radial (Photobooth §4.2)": guided,
-        "Kajiya-Kay, radial, gain not bounded": replace(guided, floor=0.0),
-        "Kajiya-Kay, kriged": kriged,
-        "Kajiya-Kay, kriged, turned": refined(kriged),
+        "Kajiya-Kay, radial, turned": refined(guided),
     }, stage
 
 
