@@ -18,7 +18,6 @@ from appearance.render.mixed import Environment
 from appearance.render.olat import render_indirect, render_olat, spread_out
 from appearance.render.smoothed import (
     DIRECT,
-    environment_parts,
     environment_smoothed,
     mean_factor,
     olat_smoothed,
@@ -36,10 +35,6 @@ _LAG = 1.5
 """Radians that a tip is behind its root in a sway."""
 _ACROSS = 12.0
 """Radians a metre that roots are behind each other."""
-OVER_FRAMES = 1.5
-"""Frames that the indirect light of moving hair is averaged over."""
-MOVING_DIRECT = 24
-"""Times the paths of all light that moving hair's direct light takes."""
 CELLS = 10, 24
 """Rows and columns of the panels that a turning map becomes."""
 _FAR = 100.0
@@ -90,26 +85,18 @@ def moving(
 ) -> Floats:
     """Radiance `(T, H, W, 3)` of the model in each of `poses`, under the same lights and maps.
 
-    Its field moves with the strands. Under maps, indirect light is averaged over `OVER_FRAMES`
-    frames, each of random numbers of its own, and direct light takes `MOVING_DIRECT` times the
-    paths: else noise changes more from frame to frame than the hair does. Raises `ValueError` for
-    poses of another topology.
+    Its field moves with the strands. All frames have the same random numbers, so that what does not
+    move does not flicker. Raises `ValueError` for poses of another topology.
     """
-    out, parts, maps = [], [], [x.shown() for x in lit[1]]
+    out, maps = [], [x.shown() for x in lit[1]]
     for k, pose in enumerate(poses):
         progress(f"frame {k + 1} of {len(poses)}", k / len(poses))
-        scene, own = fitted.scene(pose), replace(sampling, seed=sampling.seed * len(poses) + k)
-        out.append(np.zeros((camera.height, camera.width, 3), np.float32))
+        scene, frame = fitted.scene(pose), np.zeros((camera.height, camera.width, 3), np.float32)
         for light in lit[0]:
-            out[-1] += olat_smoothed(scene, camera, [light], sampling)[0]
-        parts.append([environment_parts(scene, camera, x, own, MOVING_DIRECT) for x in maps])
-    for of_map in zip(*parts, strict=True):
-        share = {kind: np.stack([x.share[kind] for x in of_map]) for kind in of_map[0].share}
-        smooth = smoothed(
-            np.stack([x.indirect for x in of_map]), share, of_map[0].sigma, OVER_FRAMES
-        )
-        for frame, part, indirect in zip(out, of_map, smooth, strict=True):
-            frame += part.shown(indirect)
+            frame += olat_smoothed(scene, camera, [light], sampling)[0]
+        for envmap in maps:
+            frame += environment_smoothed(scene, camera, envmap, sampling)
+        out.append(frame)
     return np.stack(out)
 
 

@@ -10,7 +10,7 @@ unbiased reference; what differs is noise there and bias of the smoothing here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from appearance.render.pixel_field import field_of
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
-from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.arrays import AnyFloats, Floats
 
 SIGMA = 1.25
 """Pixels that indirect light is averaged over."""
@@ -38,6 +38,7 @@ _AT_A_TIME = 16
 DIRECT = 64
 """Paths a pixel of direct light at least. On one grid over the pixel their error falls by 3 dB and
 more with twice as many, and each takes a quarter of the time of a path of all light."""
+_DIRECT_OF_MAPS = 12
 SHOWN = Sampling(36, 16)
 
 
@@ -90,49 +91,22 @@ def environment_smoothed(
     """`render_environment` with its indirect light smoothed: `(H, W, 3)`.
 
     `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, of large pictures over 1/160 of their width.
-    Direct light takes 12 `spp` paths a pixel: they are short, and the strands show in it. What only
-    one half of them saw is spread (`without_rare`).
+    Direct light takes `_DIRECT_OF_MAPS` times `spp` paths a pixel: they are short, and the strands
+    show in it. What only one half of them sampled is spread (`without_rare`).
     """
-    found = environment_parts(scene, camera, envmap, sampling, 12)
-    return found.shown(smoothed(found.indirect[None], found.share, found.sigma)[0])
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """A picture whose `indirect (H, W, 3)` light is still to be smoothed, over `sigma` pixels.
-
-    `share` is what `coverage` returns; the picture is the `direct` light and `factor` times what
-    is smooth.
-    """
-
-    direct: Floats
-    indirect: Floats
-    factor: Floats | float
-    share: dict[str, Floats]
-    sigma: float
-
-    def shown(self, smooth: Floats) -> Floats:
-        """The picture `(H, W, 3)`."""
-        return np.asarray(self.direct + self.factor * smooth)
-
-
-def environment_parts(
-    scene: HairScene, camera: Camera, envmap: AnyFloats, sampling: Sampling, direct: int
-) -> Parts:
-    """What `environment_smoothed` smooths, with `direct` times `spp` paths of direct light."""
     spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
     first, whole = (
         render_environment(scene, camera, envmap, replace(sampling, max_depth=depth))
         for depth in (1, sampling.max_depth)
     )
-    half = -(-direct * spp // 2)
+    half = -(-_DIRECT_OF_MAPS * spp // 2)
     one, other = (direct_environment(scene, camera, envmap, half, 2 * seed + k) for k in (1, 2))
     sigma = max(SIGMA, camera.width / 160)
     factor = mean_factor(scene, camera, envmap)
     # a field has the detail of single strands: what is smooth is the light without it
-    indirect = (whole - first) / factor
-    return Parts(without_rare(one, other, share, sigma), indirect, factor, share, sigma)
+    indirect = smoothed(((whole - first) / factor)[None], share, sigma)[0]
+    return np.asarray(without_rare(one, other, share, sigma) + factor * indirect)
 
 
 def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
@@ -157,34 +131,31 @@ def without_rare(one: Floats, other: Floats, share: dict[str, Floats], sigma: fl
     return usual + smoothed((0.5 * (one + other) - usual)[None], share, sigma)[0]
 
 
-def smoothed(
-    images: Floats, share: dict[str, Floats], sigma: float, over_frames: float = 0.0
-) -> Floats:
+def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
     """`images (L, H, W, 3)` averaged over `sigma` pixels, hair and head apart.
 
     `share` is what `coverage` returns. A pixel belongs to what covers more of it, and gets the
     local mean of that, by area, times its own share of it. Where a pixel has over twice the mean
     over 4 `sigma`, a rare path has hit it: the excess is averaged over 4 `sigma`, so that the
-    sum is kept and no blot is left. Where images are frames, each with its own share `(L, H, W)`,
-    they are averaged over `over_frames` frames too. Raises `ValueError` for `sigma` <= 0.
+    sum is kept and no blot is left. Raises `ValueError` for `sigma` <= 0.
     """
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
     out = np.zeros(images.shape, np.float32)
     is_hair = share["hair"] >= share["head"]
     for kind, mask in (("hair", is_hair), ("head", ~is_hair)):
-        weight = (share[kind] * mask).astype(np.float32).reshape(-1, *images.shape[1:3])
+        weight = (share[kind] * mask).astype(np.float32)[None]
         if not weight.any():
             continue
         rows, columns = (np.flatnonzero(weight.any(axis=(0, axis))) for axis in (2, 1))
         box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         part = (slice(None), *box)
         light = images[part] * np.broadcast_to(mask, images.shape[:3])[part][..., None]
-        out[part] += _without_blots(light, weight[part], np.array((over_frames, sigma, sigma)))
+        out[part] += _without_blots(light, weight[part], sigma)
     return out
 
 
-def _without_blots(light: Floats, weight: Floats, sigma: Array) -> Floats:
+def _without_blots(light: Floats, weight: Floats, sigma: float) -> Floats:
     """The local mean of `light (L, H, W, 3)`, and of what is rare over a wider window."""
     peak = light.max(axis=-1, keepdims=True)
     usual = light * np.minimum(
@@ -193,12 +164,9 @@ def _without_blots(light: Floats, weight: Floats, sigma: Array) -> Floats:
     return _local_mean(usual, weight, sigma) + _local_mean(light - usual, weight, _WIDE * sigma)
 
 
-def _local_mean(light: Floats, weight: Floats, sigma: Array) -> Floats:
-    """Gaussian mean of `light (L, H, W, C)` per `weight (L or 1, H, W)`, times each's weight.
-
-    `sigma (3,)` is in images, of which there is one weight each where it is not 0, and pixels.
-    """
-    area = gaussian_filter(weight, sigma, mode="constant", truncate=3.0)
+def _local_mean(light: Floats, weight: Floats, sigma: float) -> Floats:
+    """Gaussian mean of `light (L, H, W, C)` per `weight (1, H, W)`, times the weight."""
+    area = gaussian_filter(weight, (0, sigma, sigma), mode="constant", truncate=3.0)
     over = np.divide(weight, area, out=np.zeros_like(area), where=weight > 0)
-    mixed = gaussian_filter(light, (*sigma, 0), mode="constant", truncate=3.0)
+    mixed = gaussian_filter(light, (0, sigma, sigma, 0), mode="constant", truncate=3.0)
     return np.asarray(mixed * over[..., None], np.float32)

@@ -29,7 +29,6 @@ BENCHMARKS = {
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, beside baselines",
     "masks": "automatic hair masks beside true ones, at several path counts",
-    "moving": "hair that sways: its change from frame to frame beside path-traced frames",
     "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
     "soak": "a service that shoots for an hour and is killed: memory, frames, blackouts",
     "viewer": "the viewer's light beside the path tracer's; frames a second, and its shader's cost",

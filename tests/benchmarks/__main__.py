@@ -38,7 +38,6 @@ MODULES = {
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",
-    "moving": "benchmarks.appearance.moving",
     "renderers": "benchmarks.renderers.errors",
     "soak": "benchmarks.service.soak",
     "viewer": "benchmarks.viewer.shown",
