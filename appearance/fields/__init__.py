@@ -1,1 +1,1 @@
-"""Fields of reflectance on fixed strands: what a fibre's model leaves to be told by the frames."""
+"""Fields of reflectance on fixed strands: what the captured frames show beyond the fibre model."""

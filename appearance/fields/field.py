@@ -132,7 +132,7 @@ class FieldOnStrands:
     mapped: MappedStrands
     _last: dict[str, PixelField] = field(default_factory=dict)
 
-    def seen_by(self, scene: HairScene, camera: Camera, pixels: Ints) -> PixelField:
+    def at_pixels(self, scene: HairScene, camera: Camera, pixels: Ints) -> PixelField:
         """The field at the flat `pixels (P,)` of `camera`, under `HITS` rays a pixel."""
         key = hashlib.sha256(repr(camera.to_dict()).encode() + pixels.tobytes()).hexdigest()
         if key not in self._last:

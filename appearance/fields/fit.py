@@ -1,4 +1,4 @@
-"""A field fitted to pictures: the ridge that left-out pictures prefer, then all pictures."""
+"""A field fitted to images: the ridge by cross-validation, then a fit to all images."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MARGIN = 2.0
 
 @dataclass(frozen=True)
 class Monitor:
-    """Who follows a fit, and the file in which it keeps where it stands; see `fit_pictures`."""
+    """Receives the progress of a fit, and names the file in which it saves its state."""
 
     progress: Progress = silent
     checkpoint: Path | None = None
@@ -42,7 +42,7 @@ class Monitor:
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A field and what is known of it.
+    """A field and its validation.
 
     `validation` has, by group of `GROUPS`, the PSNR in dB of left-out pictures "without" the field
     and "with" ones that were fitted to others, and the "spread" (standard error) of the gain;
@@ -60,13 +60,13 @@ class FieldFit:
     warnings: list[str] = dataclasses.field(default_factory=list)
 
     def doubts(self) -> list[str]:
-        """Why its pictures may be no better than those without it; empty where they are better.
+        """Why its images may be no better than those without it; empty if they are better.
 
         They are where every group gains, views and lights that are both new more than their own
         spread, and all together more than `MARGIN` spreads.
         """
         if not self.validation:
-            return ["nothing could be left out, so nothing says whether it is better"]
+            return ["nothing could be left out, so it has no validation"]
         out = [
             f"{group}: pictures are better without it, {score['without']:.2f} dB against "
             f"{score['with']:.2f} (spread of the gain {score['spread']:.2f})"
@@ -149,17 +149,17 @@ class _Fit:
             found = cross_validated(self.data, self.folds, self.monitor.checkpoint, validating)
             if found.best == len(ridges) - 1:
                 self.warnings.append(
-                    f"the weakest ridge of those allowed, {found.ridge:g}, is best"
+                    f"The weakest ridge, {found.ridge:g}, is best: the field may overfit."
                 )
             if found.best == 0:
                 self.warnings.append(
-                    f"the strongest ridge allowed, {found.ridge:g}, is best: it says little"
+                    f"The strongest ridge, {found.ridge:g}, is best: the field changes little."
                 )
         else:
             found = Verdict(ridges[0], 0, [], {}, (0.0, np.inf), None)
             self.warnings.append(
-                "one view and fewer than 4 lights: nothing can be left out, so the strongest ridge "
-                "is used and nothing says whether the field is better than none"
+                "One view and fewer than 4 lights: nothing can be left out, so the strongest ridge "
+                "is used and the field has no validation."
             )
         progress("fitting to all pictures", 0.9)
         fine, clamped = self._final(found.ridge, found.start)
@@ -189,8 +189,8 @@ class _Fit:
             data = replace(data, grams=grams)
         if clamped > MOST_CLAMPED:
             self.warnings.append(
-                f"{clamped:.1%} of the samples are modulated below black, and shown black: inverse "
-                "rendering is far from these frames"
+                f"{clamped:.1%} of the samples are modulated below black and shown black: the "
+                "material is far from these frames."
             )
         return fine, clamped
 

@@ -134,7 +134,7 @@ class Interpolation:
         )
         return replace(self, field=field, sources=sources)
 
-    def seen_by(self, hits: Hits) -> Relit:
+    def at_hits(self, hits: Hits) -> Relit:
         """The field at the pixels of `hits`, of any camera and any pose of the same strands.
 
         A captured camera, where `hits` are its source's, has its own samples and no others'.

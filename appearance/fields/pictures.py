@@ -1,4 +1,4 @@
-"""A view of a fit: what was captured of some pixels beside what inverse rendering makes of them."""
+"""A view of a fit: captured and rendered images of some pixels."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class CapturedView:
     def index(self, points: AnyFloats) -> Ints:
         """Which of the pixels each of the world `points (..., 3)` falls on; -1 where on none.
 
-        Whether something else hides the point is not asked.
+        Occlusion by something else is not tested.
         """
         number = np.full(self.camera.width * self.camera.height, -1)
         number[self.pixels] = np.arange(len(self.pixels))
@@ -87,11 +87,11 @@ def gather(
     views = []
     for k, camera in enumerate(cameras):
 
-        def told(what: str, share: float, done: int = k) -> None:
+        def of_camera(what: str, share: float, done: int = k) -> None:
             progress(what, (done + share) / len(cameras))
 
         index = np.asarray(pixels[camera.name], np.int64)
-        views.append(_view(_Frames(capture, camera, names, index, scale), folder, told))
+        views.append(_view(_Frames(capture, camera, names, index, scale), folder, of_camera))
     return ReflectanceField(tuple(capture.rig.light(n) for n in names), tuple(views), scale)
 
 

@@ -42,11 +42,11 @@ class Search:
         i, j = np.unravel_index(int(self.errors.mean(axis=0).argmin()), self.errors.shape[1:])
         return KajiyaKay(DIFFUSE[i], EXPONENT[j])
 
-    def tell(self, stage: Stage) -> None:
-        """Write what was found, with its spread over the lights, and warn where it is weak.
+    def record(self, stage: Stage) -> None:
+        """Record the parameters in `stage`, with their spread over the lights, and its warnings.
 
-        Weak is a best value at the end of the grid, a best model that standard interpolation beats,
-        and lights that do not agree.
+        Warned of are a best value at the end of the grid, a best model that standard interpolation
+        beats, and lights that do not agree.
         """
         best = self.best
         each = [np.unravel_index(int(e.argmin()), e.shape) for e in self.errors]

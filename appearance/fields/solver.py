@@ -23,8 +23,8 @@ def ignore(_done: int, _coefficients: Floats, _gradient: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """A view in one or more fits: what its pixels show of a field, and its pictures reduced.
+class ViewSystem:
+    """A view in one or more fits: the basis of its pixels, and its images reduced to quadratics.
 
     Its pictures may be in parts, `grams`, of which each belongs to the fits with numbers in `fits`.
     """
@@ -41,7 +41,7 @@ class Seen:
     def summed(self, of: Callable[[Gram, list[int]], Floats]) -> Floats:
         """The sum `(P, n, 3 · used)` of what the parts `(P, n, 3, …)` add to the fits they are in.
 
-        `of` is told a part and where its fits are among those used.
+        `of` gets a part and where its fits are among those used.
         """
         used, n = self.used, self.basis.harmonics
         total = np.zeros((len(self.grams[0].right), n, 3, len(used)), np.float32)
@@ -63,7 +63,7 @@ class LeastSquares:
     that `dataclasses.replace` makes of this one.
     """
 
-    views: Sequence[Seen]
+    views: Sequence[ViewSystem]
     nested: Any
     form: Form
     ridge: float
@@ -91,7 +91,7 @@ class LeastSquares:
     def times(self, coefficients: Floats) -> Floats:
         """The left side of the normal equations times `coefficients (N, Q · 3 · F)`."""
         fine: Floats = self.nested @ coefficients
-        pixels = (_times(seen, g) for seen, g in zip(self.views, self._pixels(fine), strict=True))
+        pixels = (_times(view, g) for view, g in zip(self.views, self._pixels(fine), strict=True))
         gathered = self.nested.T @ self._at_anchors(_anchors, pixels)
         return np.asarray(gathered + self.penalty * coefficients)
 
@@ -116,25 +116,25 @@ class LeastSquares:
     def _pixels(self, fine: Floats) -> Iterator[Floats]:
         """Of each view `(P, n, 3 · used)`."""
         parts: dict[tuple[int, ...], Floats] = {}
-        for seen in self.views:
-            used = seen.used
+        for view in self.views:
+            used = view.used
             if used not in parts:
                 every = len(used) == self.fits
                 some = fine if every else np.take(_split(fine, self.fits), used, axis=-1)
                 parts[used] = some.reshape(len(fine), -1)
-            yield seen.basis.at_pixels(parts[used])
+            yield view.basis.at_pixels(parts[used])
 
     def _at_anchors(
         self, gather: Callable[[ViewBasis, Floats], Floats], pixels: Iterable[Floats]
     ) -> Floats:
         """What views have at their pixels, summed up at the finest anchors `(M, Q · 3 · F)`."""
         parts: dict[tuple[int, ...], Floats] = {}
-        for seen, values in zip(self.views, pixels, strict=True):
-            found = gather(seen.basis, values)
-            if seen.used in parts:
-                parts[seen.used] += found
+        for view, values in zip(self.views, pixels, strict=True):
+            found = gather(view.basis, values)
+            if view.used in parts:
+                parts[view.used] += found
             else:
-                parts[seen.used] = found
+                parts[view.used] = found
         total = np.zeros((self.nested.shape[0], self.shape[1]), np.float32)
         for used, found in parts.items():
             if len(used) == self.fits:
@@ -153,10 +153,10 @@ def _squared(basis: ViewBasis, values: Floats) -> Floats:
     return basis.squares(values)
 
 
-def _times(seen: Seen, g: Floats) -> Floats:
+def _times(view: ViewSystem, g: Floats) -> Floats:
     """The matrices of the fits that a view is in, times `g (P, n, 3 · used)`."""
     each = g.reshape(*g.shape[:2], 3, -1)
-    return seen.summed(lambda gram, at: gram.times(np.take(each, at, axis=-1)))
+    return view.summed(lambda gram, at: gram.times(np.take(each, at, axis=-1)))
 
 
 def _split(values: Floats, fits: int) -> Floats:
@@ -174,7 +174,7 @@ def conjugate_gradients(
 
     Preconditioned by the diagonal. Each fit ends after `iterations`, or once its preconditioned
     gradient has fallen to `tolerance` of that at 0: the answer is that of F systems solved one by
-    one. A coefficient that no observation meets stays 0. `on_iteration` is told the largest
+    one. A coefficient that no observation depends on stays 0. `on_iteration` gets the largest
     gradient.
     """
     right = system.right()

@@ -1,4 +1,4 @@
-"""Cross-validation of a field: the ridge that left-out pictures prefer, and what it is worth."""
+"""Cross-validation of a field: its ridge, and its gain, by left-out images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from appearance.fields.form import Form
 from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
-from appearance.fields.solver import Iteration, LeastSquares, Seen, conjugate_gradients
+from appearance.fields.solver import Iteration, LeastSquares, ViewSystem, conjugate_gradients
 from appearance.metrics.scores import srgb
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
@@ -111,7 +111,7 @@ class Data:
                 for part in parts
             ]
             if any(fits):
-                seen.append(Seen(basis, list(parts.values()), fits))
+                seen.append(ViewSystem(basis, list(parts.values()), fits))
         return LeastSquares(seen, self.nested, self.form, ridge, len(which))
 
     @property
@@ -125,10 +125,12 @@ class Data:
         each = max(1, BLOCK // one)
         return [range(k, min(k + each, folds.count)) for k in range(0, folds.count, each)]
 
-    def solved(self, system: LeastSquares, start: Floats | None, told: Iteration) -> Floats:
+    def solved(self, system: LeastSquares, start: Floats | None, on_iteration: Iteration) -> Floats:
         """Its minimum `(N, Q · 3)`, by conjugate gradients."""
         options = self.options
-        return conjugate_gradients(system, options.iterations, options.tolerance, start, told)
+        return conjugate_gradients(
+            system, options.iterations, options.tolerance, start, on_iteration
+        )
 
     def judging(self, view: int, fine: Floats) -> PixelField:
         """The fields of `fine (M, Q · 3 · F)` at the pixels that judge a view."""
@@ -147,7 +149,7 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The `ridge` that is chosen, all that were tried, and what left-out pictures say.
+    """The `ridge` that is chosen, all that were tried, and the scores of left-out images.
 
     `tried` are ridges with the mean gain, over groups, of left-out pictures over those without a
     field, and its standard error, in dB. `validation` and `gain`: see `FieldFit`. `start` are

@@ -108,7 +108,7 @@ def interpolation_of(
         return found
     names = [field.lights[int((i + 0.5) * count / most)].name for i in range(most)]
     search = searched(found, names, progress=part_of(progress, 0.5, 0.8))
-    search.tell(stage)
+    search.record(stage)
     found = replace(found, model=search.best)
     return refined(found, part_of(progress, 0.8, 1.0)) if options.refine else found
 
@@ -143,7 +143,7 @@ def with_samples(
     flat = image.reshape(-1, 3)
     source = None if pose.strands is not None else _source(interpolation, camera)
     if source is not None:
-        radiance, known = interpolation.seen_by(source.hits).under_all(lights)
+        radiance, known = interpolation.at_hits(source.hits).under_all(lights)
         served = known > 0
         flat[source.view.pixels[served]] = radiance[served]
         return image, {"hair_unseen": float(1 - served.mean())}
@@ -151,7 +151,7 @@ def with_samples(
     shares = coverage(mapped.scene, camera)
     pixels = np.flatnonzero(shares["hair"])
     hits = find_hits(mapped, camera, pixels, HITS)
-    radiance, known = interpolation.seen_by(hits).under_all(lights)
+    radiance, known = interpolation.at_hits(hits).under_all(lights)
     hair = hits.column("weight").sum(axis=1)
     subject = np.maximum(hair + shares["head"].ravel()[pixels], 1e-6)
     left = np.clip(1 - known / subject, 0, 1)

@@ -47,15 +47,15 @@ class PixelField:
         fields = self.coefficients.shape[2] // 3
         out = np.repeat(radiance, fields, axis=-1)
         for i, light in enumerate(lights):
-            answer = self.answer(light)
+            response = self.response(light)
             if not self.additive:
-                out[i] *= np.maximum(1 + answer, 0)
+                out[i] *= np.maximum(1 + response, 0)
                 continue
-            lit = answer * np.repeat(self.irradiance(light), fields, axis=-1)
+            lit = response * np.repeat(self.irradiance(light), fields, axis=-1)
             out[i] = np.maximum(lit if self.alone else out[i] + lit, 0)
         return out
 
-    def answer(self, light: Light) -> Floats:
+    def response(self, light: Light) -> Floats:
         """a `(P, 3)` under one light."""
         y = harmonics(light.position - self.points, self.degree)
         return np.asarray(np.matmul(y[:, None], self.coefficients)[:, 0])
@@ -72,7 +72,7 @@ class PixelField:
         whose integrals with the harmonics are `(n, 3)` each: `(P, 3)`."""
         total = np.zeros((len(self.points), 3))
         for light, weight in zip(lights, weights, strict=True):
-            total += weight * self.answer(light) * self.irradiance(light)
+            total += weight * self.response(light) * self.irradiance(light)
         for each in integrals:
             total += np.einsum("nc,pnc->pc", each, self.coefficients)
         return total.astype(np.float32)
@@ -113,7 +113,7 @@ def field_of(scene: HairScene, camera: Camera, pixels: Ints) -> PixelField | Non
     """The field of `scene` at the flat `pixels (P,)`; None where it has none."""
     if scene.field is None or not len(pixels):
         return None
-    seen: PixelField = scene.field.seen_by(scene, camera, pixels)
+    seen: PixelField = scene.field.at_pixels(scene, camera, pixels)
     return seen
 
 

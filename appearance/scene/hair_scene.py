@@ -32,7 +32,7 @@ SCALE = 100.0
 class SceneField(Protocol):
     """A field of reflectance on hair; what it gives is a `render.pixel_field.PixelField`."""
 
-    def seen_by(self, scene: HairScene, camera: Camera, pixels: Ints) -> Any:
+    def at_pixels(self, scene: HairScene, camera: Camera, pixels: Ints) -> Any:
         """The field at the flat `pixels (P,)` of `camera`."""
 
 

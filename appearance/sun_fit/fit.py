@@ -104,16 +104,15 @@ def fit(
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
-            stage.warn("no camera sees skin: its colour is a guess")
+            stage.warn("Skin is visible in no camera: its colour is a guess.")
         red, green, blue = fitting.absorption_error(colours)
         stage.figures["sigma_a_error"] = [red, green, blue]
         for warning in absorption_warnings(colours.hair.sigma_a, (red, green, blue)):
             stage.warn(warning)
         if capture.plan.get("import", {}).get("relative"):
             stage.warn(
-                "the pictures are in relative units: how dark the hair is, is guessed with the "
-                "lights' strength; import them with a grey ball, or with `scale` and the lights' "
-                "intensities, to know it"
+                "Radiometric scale unknown: hair albedo is relative until you import with `scale` "
+                "or a grey ball (docs/how-to/import.md)."
             )
     made = (colours.hair, colours.colour, colours.skin, exposure)
     variances = float(variance_of_roughness(roughness.beta_m)), found.plain.v, found.printed
@@ -224,7 +223,7 @@ class SunFit:
 
     @cached_property
     def in_front(self) -> FitPixels:
-        """Those, and hair under lights on its camera's side only: what its colour is told by."""
+        """Those, but hair under lights on its camera's side only, for its colour."""
         return in_front(self.covered, self.scene)
 
     def colour(
@@ -260,18 +259,18 @@ class SunFit:
         seen, kept = (sum(len(o.pixels) for o in p.hair) for p in (self.pixels, self.covered))
         if self.covered.hair is self.pixels.hair:
             stage.warn(
-                "the strands cover few of the pixels that show hair: the hair is found too light "
-                "where they are missing; are masks and geometry of one capture?"
+                "The strands cover under a tenth of the pixels that show hair, so its colour is "
+                "too light: check that masks and geometry are of one capture."
             )
         elif self.in_front.hair is self.covered.hair:
             stage.warn(
-                "no light stands on its camera's side of the hair: its colour is told from light "
-                "that came through it, by how much of it the strands let through"
+                "No light stands on its camera's side of the hair: the colour is estimated from "
+                "transmitted light, which depends on the density of the strands."
             )
         if self.pixels.skin and self.covered.skin is self.pixels.skin:
             stage.warn(
-                "the head covers few of the pixels that show skin: the skin is found too light "
-                "where it is missing; are masks and head of one capture?"
+                "The head covers under a tenth of the pixels that show skin, so its colour is too "
+                "light: check that masks and head are of one capture."
             )
         if kept < seen:
             why = f"the strands cover less than {COVERED:.0%} of each"
@@ -292,17 +291,19 @@ class SunFit:
         ):
             if min(values) <= least or max(values) >= most:
                 stage.warn(
-                    f"the {what} is at the end of its range, {least:g} to {most:g}: the roughness, "
-                    "which was matched with it, may be off too"
+                    f"The {what} is at the end of its range, {least:g} to {most:g}; beta_m was "
+                    "matched with it and may be off too."
                 )
         if min(result.errors) > 0.05:
-            off = f"the mean colour is off by {min(result.errors):.0%}"
-            stage.warn(f"{off}: is the geometry whole?")
+            stage.warn(
+                f"The mean colour of the renderings is off by {min(result.errors):.0%}: check that "
+                "the geometry is complete."
+            )
         return result
 
     def absorption_error(self, colours: Colours) -> list[float | None]:
-        """Standard error of log sigma_a of each channel; None where the colour does not tell it."""
-        self.progress("how the colour answers", 0.97)
+        """Standard error of log sigma_a by channel; None if the colour does not determine it."""
+        self.progress("error of the absorption", 0.97)
         sampling = Sampling(self.options.colour_spp, MAX_DEPTH, self.seed)
         errors = absorption_error(self.scene, self.covered.hair, colours, sampling)
         return [float(x) if np.isfinite(x) else None for x in errors]
@@ -326,7 +327,7 @@ class SunFit:
     def _highlights(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
     ) -> tuple[Highlight, Highlights]:
-        """What the capture shows in some pixels of these views; how renderings there are read."""
+        """The highlight of the capture in some pixels of these views, and its reader."""
         few = [self._under(o, fibres, _spread(o)) for o, fibres in views]
         few = [(o, fibres) for o, fibres in few if len(o.lights)]
         highlights = Highlights(few, self._tilt, channel)

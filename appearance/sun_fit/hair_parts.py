@@ -1,4 +1,4 @@
-"""The hair of a view in parts: sums over each, and what an answer is off by, as the parts say."""
+"""The hair of a view in parts: sums over each, and jackknife errors over them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from reconstruction.arrays import Array, Ints
 SIDE = 3
 """A view's hair is parted in 3 × 3."""
 FEWEST_PAIRS = 200
-"""Pairs of lights, over all pixels, without which there is no answer."""
+"""Fewest pairs of lights, over all pixels, for an estimate."""
 FEWEST_OF_VIEW = 1000
-"""Pairs of lights that a single view's answer needs to be compared with others."""
+"""Fewest pairs of lights of a single view whose estimate is compared with others'."""
 
 
 def parts_of(observed: Observed) -> Ints:
@@ -49,11 +49,11 @@ def leaving_out(pairs: Array) -> tuple[Array, int]:
     return np.concatenate([np.ones((1, parts)), left_out, views]), len(left_out)
 
 
-def errors(answers: Array, parts: int) -> tuple[float, float]:
-    """Standard errors of the first of `answers (N,)`: the jackknife's, and between views.
+def errors(estimates: Array, parts: int) -> tuple[float, float]:
+    """Standard errors of the first of `estimates (N,)`: the jackknife's, and between views.
 
     The next `parts` of them leave out a part of the hair each; the rest are those of single views.
     """
-    left_out, alone = answers[1 : parts + 1], answers[parts + 1 :]
+    left_out, alone = estimates[1 : parts + 1], estimates[parts + 1 :]
     between = alone.std(ddof=1) / np.sqrt(len(alone)) if len(alone) > 1 else 0.0
     return float(np.sqrt((parts - 1) * left_out.var())), float(between)

@@ -1,7 +1,7 @@
-"""What highlights show: how a pixel answers to lights near its mirror direction, and to two.
+"""The response of pixels to lights near their mirror direction, and to pairs of those.
 
-What is read is the same of a capture and of renderings of known roughness, which
-`light_correlation` sets side by side.
+It is read in the same way from a capture and from renderings of known roughness, which
+`light_correlation` compares.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WINDOW = np.pi / 3
 EDGES = np.radians([0, 8, 16, 24, 32, 40, 50, 60, 75, 90, 120])
 """Bins of |θ_i − θ_i'| of two lights."""
 INNER = slice(4, 26)
-"""Bins of the deviation that a shift brings nothing unknown into."""
+"""Bins of the deviation into which no shift brings values from outside the window."""
 SHIFTS = np.radians(np.arange(0, 31, 3))
 """Of highlights, root mean square, that profiles are read with."""
 _DEVIATIONS = np.linspace(-WINDOW, WINDOW, 31)
@@ -35,8 +35,8 @@ _DEVIATIONS = np.linspace(-WINDOW, WINDOW, 31)
 class Highlight:
     """Sums over `J` parts of the hair, `SIDE`² of each view.
 
-    `products (J, 10)` of a pixel's answers to two lights, over `EDGES`, and `pairs` how many;
-    `values (J, 30)` of its answers over the signed deviation from the mirror direction, and
+    `products (J, 10)` of a pixel's responses to two lights, over `EDGES`, and `pairs` how many;
+    `values (J, 30)` of its responses over the signed deviation from the mirror direction, and
     `samples` how many.
     """
 
@@ -61,7 +61,7 @@ class Highlight:
         return _relative(parts @ self.products, parts @ self.pairs)
 
     def profiles(self, parts: Array) -> Array:
-        """Mean answers over deviation if shifted at random `(M, S, 11)`, relative to their mean.
+        """Mean responses over deviation if shifted at random `(M, S, 11)`, relative to their mean.
 
         `S` are normal shifts of `SHIFTS`.
         """
@@ -87,7 +87,7 @@ class LightPairs:
 
     `sample (N,)`, `first` and `second (M,)` are flat indices into an `(L, P)` array; `bin_of_sample
     (N,)` and `bin_of_pair (M,)` count through the bins of one part of the hair after the other;
-    `scale (L, P)` turns radiance into the fibre's answer, 1/sr.
+    `scale (L, P)` turns radiance into the fibre's response, 1/sr.
     """
 
     sample: Ints
@@ -101,7 +101,7 @@ class LightPairs:
     def of(
         cls, observed: Observed, fibres: VisibleFibres, *, tilt_deg: float, channel: int
     ) -> LightPairs:
-        """Those of `observed`, whose pixels see `fibres`."""
+        """Those of `observed`, whose pixels show `fibres`."""
         found = near_mirror(observed, fibres, tilt_deg, WINDOW)
         part, count = parts_of(observed), observed.valid.shape[1]
         deviation = found.deviation.ravel()
@@ -125,7 +125,7 @@ class LightPairs:
         )
 
     def highlight(self, one: AnyFloats, other: AnyFloats) -> Highlight:
-        """What the radiances `one`, `other (L, P)` of the same pixels show.
+        """The highlight in the radiances `one`, `other (L, P)` of the same pixels.
 
         They are the same twice, or two renderings: then mean products are free of their noise.
         """
@@ -142,7 +142,7 @@ class LightPairs:
 
 @dataclass(frozen=True, eq=False)
 class Highlights:
-    """How highlights of `views` are read, in one colour `channel`."""
+    """Reads the highlights of `views` in one colour `channel`."""
 
     views: Sequence[tuple[Observed, VisibleFibres]]
     tilt_deg: float

@@ -18,7 +18,7 @@ WINDOW = np.pi / 6
 BINS = 32
 LEAST_SHARE, MOST_SPREAD = 0.9, 0.06
 LEAST_LIT = 0.1
-"""Of what a light sends to the pixel that it sends most to: less, and other hair lights it."""
+"""Least part of a light's brightest pixel: below it, other hair lights a pixel more."""
 _PAIRS = 96  # directions kept a bin, each with all its pixel's fibres, to average the model over
 
 

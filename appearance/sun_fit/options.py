@@ -1,4 +1,4 @@
-"""What Sun's fit can be asked for; light, so that a service checks options without the fit."""
+"""Options of Sun's fit, in a module without Mitsuba: a service checks them without loading it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from reconstruction.options import Count, options
 
 @options
 class FitOptions:
-    """How much of a capture a fit observes: pixels a camera, and samples a pixel when rendering."""
+    """Pixels a camera and cameras that a fit reads, and samples a pixel of its renderings."""
 
     hair_pixels: Count = 1000
     roughness_cameras: Count = 4

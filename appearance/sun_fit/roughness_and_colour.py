@@ -37,9 +37,9 @@ SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
 MORE = 2.0
-"""Renderings of so many times the absorption, and of its part, say how the mean colour answers."""
+"""Renderings of this factor times the absorption, and of its inverse, give the derivative."""
 LEAST_PATHS = 100_000
-"""Of each of those renderings: noise would look like an answer, or hide one."""
+"""Fewest paths of each of those renderings, against noise in the derivative."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _minimum(error: Callable[[float], float]) -> float:
 
 @dataclass(frozen=True)
 class Colours:
-    """What Algorithm 1 found: C, its hair and the skin's albedo.
+    """The result of Algorithm 1: C, its hair and the skin's albedo.
 
     `pairs` are the C that were rendered, each `(3,)`, and the hair's mean colours; `errors` how far
     off each was, relative.
@@ -124,9 +124,9 @@ def fit_colour(
 
     The light is the mean of the single lights. `scene` gives geometry, roughness and first skin
     albedo, `start (3,)` the first C. An iteration renders the observed pixels, fits R = aC + b per
-    channel (Eq. 12), takes Eq. 11's sigma of the next C, and tells `on_iteration` the error. The
-    skin's albedo follows by the ratio of captured to rendered. Ends when the hair's mean colour is
-    within `TOLERANCE`, or after `iterations` with one more update. Every rendering draws other
+    channel (Eq. 12), takes Eq. 11's sigma of the next C, and passes its error to `on_iteration`.
+    The skin's albedo follows by the ratio of captured to rendered. Ends when the hair's mean colour
+    is within `TOLERANCE`, or after `iterations` with one more update. Every rendering draws other
     random numbers, so that the fit averages their noise.
     """
     if not isinstance(scene.hair, HairAppearance):
@@ -166,9 +166,9 @@ def absorption_error(
     """Standard error of log sigma_a `(3,)`, over pixels under lights from all around.
 
     The mean captured colour over the rendered one scatters over parts of the hair, between views,
-    and between lights before, beside and behind it, which geometry that is off has disagree. By how
-    much the mean colour answers to sigma_a tells what that means for it. Infinite where it does not
-    answer, as black hair is no darker for more absorption, and at an end of C's range.
+    and between lights before, beside and behind it, if the geometry is off. It is divided by the
+    derivative of the mean colour by log sigma_a. Infinite in a channel without a derivative, as
+    black hair is no darker for more absorption, and at an end of C's range.
     """
     paths = sampling.spp * sum(len(o.pixels) for o in hair)
     sampling = replace(sampling, spp=sampling.spp * max(1, LEAST_PATHS // max(paths, 1)))

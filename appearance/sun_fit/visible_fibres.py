@@ -1,4 +1,4 @@
-"""Which fibres a camera's pixels see, and which way they run."""
+"""The fibres visible in a camera's pixels, and their directions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from reconstruction.arrays import Array, Bools, Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class VisibleFibres:
-    """What `K` rays through each of `P` pixels meet first.
+    """The first hits of `K` rays through each of `P` pixels.
 
     `point (P, K, 3)` in metres; `tangent (P, K, 3)`, unit, root to tip; `hair (P, K)` marks the
     rays that meet a fibre: where it is false, the other two are 0.

@@ -80,7 +80,7 @@ def error(made, truth):
 
 def relit_error(interpolation, light, number=1):
     hits = interpolation.sources[number].hits
-    made, known = interpolation.seen_by(hits).under([light])
+    made, known = interpolation.at_hits(hits).under([light])
     assert (known > 0).all()
     return error(made[0], kajiya_kay_picture(hits, light))
 
@@ -99,7 +99,7 @@ def test_a_captured_light_is_reproduced_from_a_captured_camera(planted):
     hits = planted.sources[0].hits
     for model in (None, KajiyaKay(0.1, 30.0)):
         one = replace(planted, model=model)
-        made, _ = one.seen_by(hits).under([one.field.lights[17]])
+        made, _ = one.at_hits(hits).under([one.field.lights[17]])
         table = one.sources[0].view.table[17].astype(float)
         np.testing.assert_allclose(made[0], table, rtol=4e-3, atol=1e-3 * table.max())
 
@@ -107,7 +107,7 @@ def test_a_captured_light_is_reproduced_from_a_captured_camera(planted):
 def test_twice_as_far_or_twice_as_bright(planted):
     hits, spot = planted.sources[1].hits, unit(np.array([0.2, -0.7, 0.5]))
     lit = [
-        planted.seen_by(hits).under([Light("x", r * spot, np.full(3, i))])[0]
+        planted.at_hits(hits).under([Light("x", r * spot, np.full(3, i))])[0]
         for r, i in ((200.0, 8.0), (200.0, 16.0), (400.0, 8.0))
     ]
     np.testing.assert_allclose(lit[1], 2 * lit[0], rtol=1e-4)
@@ -123,7 +123,7 @@ def test_between_cameras_the_true_model_beats_standard_interpolation(planted, tu
     truth = kajiya_kay_picture(hits, light)
     errors = {}
     for name, model in (("standard", None), ("true", TRUE)):
-        view = replace(planted, model=model, floor=0.05).seen_by(hits)
+        view = replace(planted, model=model, floor=0.05).at_hits(hits)
         made, known = view.under([light])
         good = known[0] > 0.9
         assert good.sum() > 30
@@ -131,11 +131,11 @@ def test_between_cameras_the_true_model_beats_standard_interpolation(planted, tu
     assert errors["true"] < 0.8 * errors["standard"]
 
 
-def test_search_finds_planted_parameters_and_tells_them(planted):
+def test_search_finds_planted_parameters_and_records_them(planted):
     found = searched(replace(planted, floor=0.0), ["l9", "l20"], cameras=1)
     assert (found.best.diffuse, found.best.exponent) == (TRUE.diffuse, TRUE.exponent)
     stage = Stage("x")
-    found.tell(stage)
+    found.record(stage)
     assert stage.figures["exponent_range"] == [TRUE.exponent, TRUE.exponent]
     assert stage.figures["worst_block"] < 0.1 * stage.figures["worst_block_standard"]
     assert stage.warnings == []
@@ -149,7 +149,7 @@ def test_search_warns_where_standard_interpolation_is_as_good(planted):
         dull.append(replace(source, view=replace(source.view, table=table.astype(np.float16))))
     found = searched(replace(planted, sources=tuple(dull)), ["l9"], cameras=1)
     stage = Stage("x")
-    found.tell(stage)
+    found.record(stage)
     assert any("standard interpolation" in w for w in stage.warnings)
 
 
@@ -178,7 +178,7 @@ def test_search_and_pictures_are_of_one_mind(planted):
     found = searched(one, ["l9"], cameras=1)
     rest, hits = one.without(lights=["l9"]), one.sources[0].hits
     model = KajiyaKay(DIFFUSE[2], EXPONENT[5])
-    made, _ = replace(rest, model=model).seen_by(hits).under([one.field.lights[9]])
+    made, _ = replace(rest, model=model).at_hits(hits).under([one.field.lights[9]])
     truth = one.sources[0].view.table[9].astype(float)
     block = blocks(one.sources[0].view.pixels, 20)
     expected = worst_block(made[0] - truth, block) / worst_block(truth, block)
@@ -239,7 +239,7 @@ def test_a_place_that_no_camera_sees_is_told(planted, tuft):
     _, mapped = tuft
     behind = camera(180, "behind")
     hits = find_hits(mapped, behind, np.arange(400), HITS)
-    view = planted.seen_by(hits)
+    view = planted.at_hits(hits)
     hair = hits.column("weight").sum(axis=1)
     assert view.known.sum() < 0.9 * hair.sum()
     made, known = view.under([planted.field.lights[3]])
@@ -256,7 +256,7 @@ def test_missing_and_saturated_samples_weigh_nothing(planted):
     table[:, 5] = np.nan
     view = replace(source.view, table=table)
     some = replace(planted, sources=(replace(source, view=view),), model=TRUE, floor=0.0)
-    made, known = some.seen_by(source.hits).under([light])
+    made, known = some.at_hits(source.hits).under([light])
     truth = kajiya_kay_picture(source.hits, light)
     assert known[0, 5] == 0
     assert (made[0, 5] == 0).all()
@@ -272,7 +272,7 @@ def test_under_all_lights_half_of_the_light_is_not_all_of_it(planted):
     assert not set(near) & set(other)
     table[near, 5] = np.nan
     some = replace(planted, sources=(replace(source, view=replace(source.view, table=table)),))
-    whole, known = some.seen_by(source.hits).under_all(two)
+    whole, known = some.at_hits(source.hits).under_all(two)
     assert known[5] == 0
     truth = sum(kajiya_kay_picture(source.hits, x) for x in two)
     assert error(whole[known > 0], truth[known > 0]) < 5e-3
@@ -283,12 +283,12 @@ def test_black_frames_and_dark_lights(planted):
     source = planted.sources[1]
     black = replace(source.view, table=np.zeros_like(source.view.table))
     some = replace(planted, sources=(replace(source, view=black),), model=TRUE)
-    made, known = some.seen_by(source.hits).under([planted.field.lights[3]])
+    made, known = some.at_hits(source.hits).under([planted.field.lights[3]])
     assert (made == 0).all()
     assert (known > 0).all()
     off = tuple(replace(x, intensity=np.zeros(3)) for x in planted.field.lights)
     dark = replace(planted, field=replace(planted.field, lights=off))
-    _, known = dark.seen_by(source.hits).under([planted.field.lights[3]])
+    _, known = dark.at_hits(source.hits).under([planted.field.lights[3]])
     assert (known == 0).all()  # samples of lights that were off say nothing
 
 
@@ -305,8 +305,8 @@ def test_moved_strands_keep_their_samples(planted, tuft):
     light = Light("new", unit(np.array([0.35, -0.8, 0.4])), np.full(3, 5.0))
     there = Light("there", turn @ light.position, light.intensity)
     model = replace(planted, model=TRUE, floor=0.05)
-    made, known = model.seen_by(hits).under([there])
-    expected, _ = model.seen_by(planted.sources[1].hits).under([light])
+    made, known = model.at_hits(hits).under([there])
+    expected, _ = model.at_hits(planted.sources[1].hits).under([light])
     good = known[0] > 0.9
     assert good.sum() > 30
     assert error(made[0][good], expected[0][good]) < 0.35  # seen by one camera, from another place
@@ -378,7 +378,7 @@ class TestEnvironments:
 
     def test_the_whole_map_is_the_sum_of_its_lights(self, planted):
         sky = Environment(studio(32))
-        view = replace(planted, model=TRUE).seen_by(planted.sources[1].hits)
+        view = replace(planted, model=TRUE).at_hits(planted.sources[1].hits)
         lights = environment_lights(sky, rows=6)
         whole, _ = view.under_all(lights)
         single = sum(view.under([x])[0][0] for x in lights)

@@ -63,7 +63,7 @@ class Planted:
     def __init__(self, coefficients, **kind):
         self.coefficients, self.kind = np.asarray(coefficients, np.float32), kind
 
-    def seen_by(self, scene, camera, pixels):
+    def at_pixels(self, scene, camera, pixels):
         shape = (len(pixels), *self.coefficients.shape)
         every = np.broadcast_to(self.coefficients, shape).copy()
         # a pixel's own, so that a mix-up of pixels shows
@@ -138,7 +138,7 @@ def test_smoothed_single_lights_have_the_field_in_full_detail(seen, small):
     few, bare = Sampling(16, 3), replace(scene, field=None)
     plain = olat_smoothed(bare, camera, lights, few, pixels=pixels)
     shown = olat_smoothed(scene, camera, lights, few, pixels=pixels)
-    field = scene.field.seen_by(scene, camera, pixels)
+    field = scene.field.at_pixels(scene, camera, pixels)
     np.testing.assert_allclose(shown, field.lit(plain, lights), rtol=1e-5)
     one, without = (
         render_mixed(x, camera, lights[:1], [], few).reshape(-1, 3)[pixels] for x in (scene, bare)

@@ -104,7 +104,7 @@ def test_fit_reports_what_it_did(made, fitted):
     dark = [x for x in samples.left_out if "reach no hair" in x.why]
     assert len(dark) == 1
     assert "dark" in dark[0].what
-    assert sum("relative units" in w for w in report["colour"].warnings) == 1
+    assert sum("hair albedo is relative" in w for w in report["colour"].warnings) == 1
     errors = [e for _, e in report["colour"].series[0].points]
     assert min(errors) < 0.05
     assert made[1].report().to_dict() == report.to_dict()
@@ -201,7 +201,7 @@ def test_black_hair_warns_that_its_absorption_is_unknown(made, tmp_path):
     appearance, report = fit_of(tmp_path, made, HairAppearance((6.0, 7.0, 8.0), 0.25, 0.2))
     assert min(appearance.hair.sigma_a) > 0.7
     said = report["colour"].warnings
-    assert any("end of its range" in w and "roughness" in w for w in said)
+    assert any("end of its range" in w and "beta_m" in w for w in said)
 
 
 @pytest.mark.slow

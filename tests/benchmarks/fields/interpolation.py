@@ -126,7 +126,7 @@ def variants(shot: Captured, progress: Progress) -> tuple[dict[str, Interpolatio
     standard, stage = shot.interpolation, Stage("search")
     names = [x.name for x in standard.field.lights]
     search = searched(standard, names[5 :: max(len(names) // 4, 1)], cameras=1, progress=progress)
-    search.tell(stage)
+    search.record(stage)
     guided = replace(standard, model=search.best)
     return {
         "standard, radial (Photobooth §4.1)": standard,
@@ -196,7 +196,7 @@ def measure(subject: Subject, size: Size, seed: int, progress: Progress) -> dict
                 hits = find_hits(shot.bent, shot.cameras[k], shot.pixels[k], HITS)
             else:
                 hits = one.sources[k].hits
-            add(name, k, one.seen_by(hits).under(shot.held)[0])
+            add(name, k, one.at_hits(hits).under(shot.held)[0])
         seconds[name] = time.process_time() - begun
     means = {
         name: {

@@ -96,24 +96,24 @@ def interpolated(frames: Frames, progress: Progress) -> dict[str, dict[str, floa
         lit = {}
         for k, p in enumerate(frames.pictures):
             hits = one.sources[own.index(k)].hits if k in own else p.hits
-            made = one.seen_by(hits).under(lights)[0]
+            made = one.at_hits(hits).under(lights)[0]
             lit[k] = made, made
         rows[name] = frames.psnr(lit)
     return rows
 
 
 def in_brightest(frames: Frames, field: Field, k: int, weights: Array) -> Pair:
-    """View k with the field's answer to the brightest light, for the light of all of them."""
+    """View k with the field's response to the brightest light, for the light of all of them."""
     view = frames.pictures[k]
     at, light = field.at(view.hits), view.lights[int(np.argmax(weights))]
     one, other = summed(frames.rendered[k], weights)
-    answer = at.answer(light)
+    response = at.response(light)
     if not at.additive:
-        return one * np.maximum(1 + answer, 0), other * np.maximum(1 + answer, 0)
+        return one * np.maximum(1 + response, 0), other * np.maximum(1 + response, 0)
     given = sum(w * at.irradiance(x) for w, x in zip(weights, view.lights, strict=True))
     if at.alone:
-        return np.maximum(answer * given, 0), np.maximum(answer * given, 0)
-    return np.maximum(one + answer * given, 0), np.maximum(other + answer * given, 0)
+        return np.maximum(response * given, 0), np.maximum(response * given, 0)
+    return np.maximum(one + response * given, 0), np.maximum(other + response * given, 0)
 
 
 def rows_of(
