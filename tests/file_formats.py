@@ -19,7 +19,7 @@ from appearance import Exposure, FittedModel, HairAppearance, HeldOut
 from appearance.bsdf.maps import HairMaps
 from appearance.fields.anchors import Grid, Places
 from appearance.fields.field import Field
-from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.fitted_lights import save_lights
 from appearance.render.environment_maps import load_environment
 from appearance.render.harmonics import count_of
 from appearance.sun_fit.fitted_appearance import FittedAppearance

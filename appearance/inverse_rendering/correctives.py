@@ -24,7 +24,7 @@ from appearance.inverse_rendering.unknowns import MOST_TURN, Raw, decode, encode
 from reconstruction.arrays import Array, Ints
 
 WIDTH = 0.2
-"""Standard deviation in radians of a corrective before frames are seen."""
+"""Prior standard deviation of a corrective, radians."""
 PRIOR_WEIGHT = 1e-3
 """Of half the mean squared corrective, in widths, beside the image loss."""
 _TURNS, _ITERATIONS = 2, 30
@@ -38,7 +38,7 @@ _ALIKE = 1e-4
 
 @dataclass(frozen=True)
 class Correctives:
-    """What was found: the unconstrained numbers `raw`, and the error under the judging lights.
+    """The result: the unconstrained numbers `raw`, and the error under the judging lights.
 
     `taken` are the shares of the steps that were taken: none, and `raw` is what it was, where
     correctives do the judging lights no good.
@@ -71,7 +71,7 @@ def solve_correctives(
         return Correctives(raw, (), 0.0, 0.0)
     depth_one = replace(effort, spp=direct_spp(sum(len(o.pixels) for o in problem.views)))
     rest = [problem.indirect(raw, gain, k, effort, seed + k) for k in range(len(problem.views))]
-    seen, judging = (
+    fitted, judging = (
         [
             _View(problem, problem.direct(raw, gain, patch, depth_one, seed + 100 + k), rest[k])
             for k, patch in enumerate(_patches(problem, chosen))
@@ -82,7 +82,7 @@ def solve_correctives(
     start_error = error = _error(judging, maps)
     taken: list[float] = []
     for _ in range(_TURNS):
-        step = _step(seen, maps, lambda_r)
+        step = _step(fitted, maps, lambda_r)
         tried = []
         for share in _SHARES:
             rotation = np.clip(maps.rotation + share * step, -0.9 * MOST_TURN, 0.9 * MOST_TURN)

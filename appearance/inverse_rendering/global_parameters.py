@@ -1,4 +1,4 @@
-"""Roughness, index, mean colour and light intensities: few numbers, found from pictures alone.
+"""Roughness, index, mean colour and light intensities: the global parameters, from images.
 
 Gauss-Newton on kept paths, its derivatives on the left and on the right estimated apart: the square
 of a path tracer's derivative is mostly noise. On the left stand instruments Z, the hardly noisy
@@ -43,12 +43,12 @@ _BEGINS = (-1.8, 0.4)
 _ALIKE = 3 * 32
 """Values in a row that may be off together."""
 FOUND = {"beta_m": (0.05, 0.8), "beta_n": (0.2, 0.7)}
-"""Roughness that was found again from pictures, wherever it began; what ends beyond is doubtful."""
+"""Roughness recovered from any start in tests; a result outside these ranges is doubtful."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The pictures that numbers are found from: `pairs`, pixels and paths, and a seed."""
+    """The images that a solve uses: `pairs`, pixels and paths, and a seed."""
 
     pairs: Sequence[Batch]
     effort: Effort
@@ -56,10 +56,10 @@ class Evidence:
 
 
 class Solved(NamedTuple):
-    """What was found: `raw` and `gain (L,)`.
+    """The solution: `raw` and `gain (L,)`.
 
     `left_open`: by name, the standard error of an estimate over the width of `WIDE` that it begins
-    with, of the channel known least; 1 is a flat response, which the pictures say nothing of.
+    with, of the least certain channel; 1 is a flat response: images do not depend on it.
     """
 
     raw: Raw
@@ -85,7 +85,7 @@ def solve_global_parameters(
     (Black hair from a grey start: beta_m within 10 %, its index off by up to 0.15; with the index
     held, beta_m 0.31 to 0.40 for 0.25.)
     Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
-    is not finite, it gives back what it got.
+    is not finite, the input is returned.
     """
     lights = np.unique(np.concatenate([b.lights for b in evidence.pairs]))
     numbers = [
@@ -211,7 +211,7 @@ class _System:
         seen = self.problem.compare(patch, halves.mean(axis=0))
         weight = np.where(seen.valid[..., None], losses.weights(seen.level), 0)
         if self.noise[k].size:
-            # of other paths: weights that know this picture's noise would choose among it
+            # of other paths: weights from this picture's noise would select among it
             weight = losses.noise_weighted(weight, self.noise[k])
         self.noise[k] = (halves[0] - halves[1]) ** 2
         left, right = [], []

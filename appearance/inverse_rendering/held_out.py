@@ -1,4 +1,4 @@
-"""Held-out frames beside what the fit makes of them: scores and error maps."""
+"""Held-out frames beside the fit's renderings: scores and error maps."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def judge(
 ) -> dict[str, dict[str, float]]:
     """Mean `metrics.scores` and "relative_error" of each of `fits` over lit `frames`; {} of none.
 
-    Pixels that are saturated in a frame say nothing there.
+    Pixels that are saturated in a frame are skipped there.
 
     Writes the model's `inverse_rendering.png`: each frame as captured, as each fit renders it, and
     the last one's error map.

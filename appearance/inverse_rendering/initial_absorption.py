@@ -29,7 +29,7 @@ _RAYS = 8
 _PATHS = 100_000
 """Of a round, over all views: the more pixels show a cell, the fewer paths each of them needs."""
 _WIDE = 0.02
-"""Share of what a cell's far neighbours say: all that a cell has which no ray meets."""
+"""Weight of a cell's far neighbours, which alone determine a cell that no ray hits."""
 
 
 def absorption_of_cells(
@@ -45,7 +45,7 @@ def absorption_of_cells(
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
     The first `whole` rounds take the whole step, those after them a half, a third and so on: the
-    mean of what they would say, as each of them has its own noise (Robbins and Monro 1951).
+    mean of their estimates, as each of them has its own noise (Robbins and Monro 1951).
     The light is the mean of the valid single lights of each pixel. A round costs what 100,000 paths
     do, however many pixels and lights there are: at most a quarter of `effort`'s paths a pixel,
     at least one.

@@ -21,7 +21,7 @@ from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 SCALARS = ("beta_m", "beta_n", "eta")
 SHARED = ("sigma_a", *SCALARS)
 _DARK = 1e-25
-"""BSDF below which a path counts as black: its logarithm's derivative is not asked for."""
+"""BSDF below which a path counts as black and its logarithm has no derivative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class LinearisedPictures:
 
 
 def _moving(value: Any) -> Any:
-    """A copy of a Dr.Jit `value` whose derivative is asked for, forwards."""
+    """A copy of a Dr.Jit `value` with forward-mode gradients enabled."""
     kind: Any = type(value)
     out = kind(value)
     dr.enable_grad(out)

@@ -58,8 +58,8 @@ class Outcome:
     `gain (L,)` are factors on the lights' intensities. `ended` is "converged", what was kept of the
     start, or why there was nothing to fit; `start_error` and `error` are those of full images of
     all pairs, at the start and at the result, under fresh random numbers and alike for both
-    (`FitProblem.whole_errors`). `sure` is the share of random draws of the parts of the hair in
-    which the best result is better than the start (bootstrap): below `SURE`, maps and gain are the
+    (`FitProblem.full_image_errors`). `sure` is the share of random draws of the parts of the hair
+    in which the best result is better than the start (bootstrap): below `SURE`, maps and gain are the
     start's, and `refused` is the result. `history` holds (seconds, validation error). `left_open`:
     see `global_parameters.Solved`; empty where no number was solved for.
     """
@@ -260,13 +260,13 @@ class _Fit:
             guesses.append((self.first, state.gain, kept))
         guesses.append((self.first, self.gain, ""))
         pairs = [(raw, gain) for raw, gain, _ in guesses]
-        parts = self.problem.whole_errors(pairs, self.used, self.options.effort, seed)
+        parts = self.problem.full_image_errors(pairs, self.used, self.options.effort, seed)
         *errors, begun = (float(x.mean()) for x in parts)
         best = int(np.argmin(errors))
         raw, gain, how = guesses[best]
         maps = decode(raw)
         sure, kept = _sure(parts[-1] - parts[best]), f"{ended}; kept the start"
-        # in cells, though all alike: the next variant need not tell them apart again
+        # in cells, though all alike: the next variant starts from the same shape
         as_begun = self.start.resized(self.first["sigma_a"].shape[:3])
         start = Outcome(as_begun, self.gain, kept, begun, begun, self.history, sure)
         start = replace(start, left_open=state.left_open)

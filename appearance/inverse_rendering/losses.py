@@ -15,7 +15,7 @@ from reconstruction.arrays import Array, Bools
 
 FLOOR = 0.03
 LEAST_NOISE = 0.1
-"""Of the median pixel's: what a pixel's noise is held to be at least, known from few paths."""
+"""Least noise of a pixel, relative to the median: few paths estimate it poorly."""
 LEAST_ERROR = 0.02
 """Of the root of the squares: below it smoothness weighs no more."""
 LAMBDA_R = 0.003

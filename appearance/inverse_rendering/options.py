@@ -1,4 +1,4 @@
-"""How a fit is run: what is free, how fine, and what a step may cost."""
+"""Options of inverse rendering: free parameters, resolution, and cost of an image."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from reconstruction.options import Count, options
 
 Variant = Literal["original", "spatial", "correctives", "lights"]
-"""The ablations of GroomLight's Table 1, each with what the ones before it free."""
+"""The ablations of GroomLight's Table 1; each frees the parameters of those before it too."""
 
 
 @options
@@ -42,7 +42,7 @@ class InverseRenderingRequest:
 
     Of the training lights `lights` are fitted and `validation_lights` decide whether the result is
     rendered (see `fit_validated`). `hair_pixels` a camera are fitted, one colour before the volume.
-    `max_depth` is the number of vertices a path may have; None measures what the hair needs.
+    `max_depth` is the number of vertices a path may have; None measures the depth that is needed.
     Held-out images are judged with `judged_spp` paths a pixel. `fit` is how the fit is run. The
     defaults are what a minute buys, the numbers that all hair shares: maps (variants from "spatial"
     on) want 24 lights, 4,000 pixels, and an `Effort` of 600 pixels and 128 paths.

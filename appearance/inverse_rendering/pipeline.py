@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
-from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found, save_lights
+from appearance.inverse_rendering.fitted_lights import LIGHTS_FILE, fitted_lights, save_lights
 from appearance.inverse_rendering.global_parameters import FOUND
 from appearance.inverse_rendering.held_out import Judged, held_out_frames, judge
 from appearance.inverse_rendering.loop import SURE, Monitor, Outcome, run
@@ -33,9 +33,9 @@ JUDGED_IMAGES = 12
 """Held-out images that are judged, at most."""
 MOST_DEPTH = 16
 FLAT = 0.7
-"""Left open of a number's width, beyond which its response is flat: of its square, half."""
+"""Standard error over the prior's width above which the response is flat: of its square, half."""
 FROM_SUN = 1.15
-"""Times Sun's roughness, or one over it, that the fit to pictures may end at without a doubt."""
+"""Ratio to Sun's roughness, or its inverse, above which a fitted roughness is doubtful."""
 BLACKER = 3.0
 """Times the start's absorption, beyond which black hair ends too rough where the index is held."""
 
@@ -59,7 +59,7 @@ def fit_maps(
     Returns `{"ended", "error", "start_error", "sure",
     "accepted", "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
     "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
-    fit and of what was found; "doubts" are warnings for whoever renders what was found. Raises
+    fit and of the result; "doubts" are warnings if the result is rendered. Raises
     `CaptureError` or `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
@@ -103,7 +103,7 @@ def fit_maps(
         }
         frames = held_out_frames(capture, model, held_out, JUDGED_IMAGES)
         if frames:
-            lights = tuple(lights_as_found(judged, capture.rig.lights))
+            lights = tuple(fitted_lights(judged, capture.rig.lights))
             fits = {
                 name: Judged(mapped.with_maps(maps).with_skin(fitted.skin), rig)
                 for name, maps, rig in (
@@ -130,32 +130,31 @@ def fit_maps(
 
 
 def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
-    """What a user has to know of fitted roughness to believe it."""
+    """Why a fitted roughness is doubtful, one sentence each; empty if it is not."""
     doubts = [
-        f"{name} {value:.2f} is beyond {least} to {most}: too far to be sure of"
+        f"{name} {value:.2f} lies outside {least} to {most}, the range in which it was recovered"
         for name, (least, most) in FOUND.items()
         if not least <= (value := float(getattr(found, name))) <= most
     ]
     before, after = (float(x.sigma_a.mean()) for x in (start, found))
     if after > max(1.0, BLACKER * before):
         doubts.append(
-            f"beta_m {found.beta_m:.2f} may be too rough: the hair is black, and Sun's fit is "
-            f"brighter, sigma_a {before:.2g} against {after:.2g}"
+            f"beta_m {found.beta_m:.2f} may be too rough: the hair is black, and its fit began at "
+            f"the sigma_a {before:.2g} of Sun's fit, against {after:.2g}"
         )
     if not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
         doubts.append(
-            f"beta_m {found.beta_m:.2f} is not what the highlights say, "
-            f"{start.beta_m:.2f} by Sun's fit: strands that lie beside their true places look "
-            "rougher in pictures"
+            f"beta_m {found.beta_m:.2f} differs from {start.beta_m:.2f}, measured on "
+            "highlights by Sun's fit: errors of the strands' positions look like roughness in images"
         )
     return doubts
 
 
 def _flat(left_open: Mapping[str, float]) -> list[str]:
-    """Which numbers the pictures say next to nothing of."""
+    """Which parameters the images hardly depend on, one sentence each."""
     return [
-        f"{name} is not known: pictures hardly answer to it (its standard error is {open_:.0%} of "
-        "the width that it began with), and it stays about where it began"
+        f"{name} is undetermined: its standard error is {open_:.0%} of the prior's width, and it "
+        "stays near its start"
         for name, open_ in left_open.items()
         if open_ > FLAT
     ]
@@ -170,7 +169,7 @@ def _check_memory(
     stage: Stage,
     progress: Progress,
 ) -> None:
-    """Say what the process will hold, and refuse where it needs more than there is."""
+    """Report the memory that the process will need; refuse if it is not available."""
     training = held_out.training(capture)
     hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
     pixels, lights = [min(n, request.hair_pixels) for n in hair], len(training.olat_lights())

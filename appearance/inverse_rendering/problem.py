@@ -33,7 +33,7 @@ _WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
 """Paths of whole pictures of all views together, and of a pixel at least: one or two of them, and
 noise decides what is better. And parts of a view's hair, about."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
-"""Lights that a path asks at its first vertex and at later ones, where their mean is wanted."""
+"""Lights that a path samples at its first vertex and at later ones, for means over lights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +92,10 @@ class FitProblem:
             values.append(losses.squares(one, other, weight, a.valid))
         return float(np.mean(values)) if values else 0.0
 
-    def whole_errors(
+    def full_image_errors(
         self, guesses: Sequence[tuple[Raw, Array]], used: Bools, effort: Effort, seed: int
     ) -> Array:
-        """What parts of the hair add to the error of whole pictures, of each guess `(G, B)`.
+        """The errors of full images over parts of the hair, of each guess `(G, B)`.
 
         Their mean over B is the weighted mean squared difference, noise taken off, of all hair
         pixels of the pairs `used (V, L)`. All guesses have the same weights, at the middle of what
@@ -114,7 +114,7 @@ class FitProblem:
             patch = Patch(k, lights, np.arange(len(o.pixels)))
             halves = np.zeros((len(guesses), 2, len(lights), len(o.pixels), 3))
             for g, (raw, gain) in enumerate(guesses):
-                scene, camera, packed, pixels = self._seen(raw, gain, patch)
+                scene, camera, packed, pixels = self._setup(raw, gain, patch)
                 for h in (0, 1):
                     first = seed + k + (h << 20)
                     halves[g, h] = render_olat(
@@ -162,16 +162,16 @@ class FitProblem:
 
     def render(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> Array:
         """A patch under `gain (L,)` in exposure units `(k, P, 3)`."""
-        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        scene, camera, lights, pixels = self._setup(raw, gain, patch)
         spent: dict[str, int] = {"spp": effort.spp, "max_depth": effort.max_depth, "thrift": 0}
         radiance = render_olat(scene, camera, lights, seed=seed, pixels=pixels, **spent)
         return radiance.astype(float) * self.scale
 
     def render_all(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
         """All pixels of a view under all lights `(L, P, 3)`, for means over lights: those of single
-        lights are noisy, as a path asks few of them."""
+        lights are noisy, as a path samples few of them."""
         spent = {"first_lights": _FIRST_LIGHTS, "deep_lights": _DEEP_LIGHTS}
-        scene, camera, packed, pixels = self._seen(raw, gain, self._whole(view))
+        scene, camera, packed, pixels = self._setup(raw, gain, self._whole(view))
         spent |= {"spp": effort.spp, "max_depth": effort.max_depth}
         radiance = render_olat(scene, camera, packed, seed=seed, pixels=pixels, **spent)
         return radiance.astype(float) * self.scale
@@ -180,9 +180,9 @@ class FitProblem:
         self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int
     ) -> LinearisedPictures:
         """A patch under `gain (L,)` on paths of its own, and its derivatives, in exposure units."""
-        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        scene, camera, lights, pixels = self._setup(raw, gain, patch)
         level = self._level[patch.view][patch.lights][:, patch.few].astype(float)
-        # what a light is worth is what it changes in a displayed picture
+        # a light's importance is its effect on a displayed image
         importance = self.scale * np.sqrt(losses.weights(level)).mean(axis=-1)
         wanted = WeightedPixels(pixels, importance)
         sampling = KeptSampling(max(2, effort.spp), effort.max_depth)
@@ -191,8 +191,8 @@ class FitProblem:
         return LinearisedPictures(paths, self.mapped, decode(raw), intensities)
 
     def direct(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> DirectLight:
-        """Paths of one vertex through a patch under `gain (L,)`, which every light is asked at."""
-        scene, camera, lights, pixels = self._seen(raw, gain, patch)
+        """Paths of one vertex through a patch under `gain (L,)`, a shadow ray to every light."""
+        scene, camera, lights, pixels = self._setup(raw, gain, patch)
         wanted = WeightedPixels(pixels, np.ones((len(lights), len(pixels)), np.float32))
         paths = keep_paths(scene, camera, lights, wanted, KeptSampling(effort.spp, 1, _ALL), seed)
         return DirectLight(self.mapped, patch, paths, light_arrays(lights)[1] * self.scale)
@@ -200,7 +200,7 @@ class FitProblem:
     def indirect(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
         """All pixels of a view under all lights `(L, P, 3)`, without the light that reaches the
         first hit directly."""
-        scene, camera, lights, pixels = self._seen(raw, gain, self._whole(view))
+        scene, camera, lights, pixels = self._setup(raw, gain, self._whole(view))
         spent: dict[str, int] = {
             "spp": max(_LEAST_SPP, effort.spp // 4),
             "max_depth": effort.max_depth,
@@ -231,7 +231,7 @@ class FitProblem:
         self._scene = self.mapped.update_maps(self._scene, maps)
         return self._scene
 
-    def _seen(
+    def _setup(
         self, raw: Raw, gain: Array, patch: Patch
     ) -> tuple[HairScene, Camera, list[Light], Ints]:
         """Scene, camera, lights and pixels of a patch, as `raw` and `gain (L,)` have them."""

@@ -14,7 +14,7 @@ from appearance.bsdf.absorption import of_melanin
 from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.fields.field import FIELD_FILE, Field, FieldOnStrands
-from appearance.inverse_rendering.found_lights import LIGHTS_FILE, lights_as_found
+from appearance.inverse_rendering.fitted_lights import LIGHTS_FILE, fitted_lights
 from appearance.metrics.scores import Exposure
 from appearance.observations import HeldOut
 from appearance.render.mixed import Environment, render_mixed
@@ -37,7 +37,7 @@ class FittedModel:
     `field` is what the hair reflects beyond that material, None where nothing is known of it.
     `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
     the scalp's map where they are known; they stay with the strands when they move. `rig` is the
-    capture's, its lights as inverse rendering found them; `found_lights` says how, row by row of
+    capture's, its lights as inverse rendering found them; `light_rows` says how, row by row of
     `lights.json`, empty where they were not fitted.
     """
 
@@ -47,7 +47,7 @@ class FittedModel:
     maps: HairMaps
     placed: Array | None = None
     rig: Rig | None = None
-    found_lights: Sequence[Mapping[str, Any]] = ()
+    light_rows: Sequence[Mapping[str, Any]] = ()
     field: Field | None = None
 
     @classmethod
@@ -69,7 +69,7 @@ class FittedModel:
                 )
         rig = None
         if capture is not None:
-            rig = replace(capture.rig, lights=tuple(lights_as_found(model, capture.rig.lights)))
+            rig = replace(capture.rig, lights=tuple(fitted_lights(model, capture.rig.lights)))
         found = model.json(LIGHTS_FILE) if model.has(LIGHTS_FILE) else ()
         field = Field.load(model) if with_field and model.has(FIELD_FILE) else None
         if field is not None and len(field.places.kept) != len(strands):
@@ -130,8 +130,8 @@ class FittedModel:
         appearance.save(model)
         if self.placed is not None or not self.maps.uniform:
             self.maps.save(model, self.root_uv)
-        if self.found_lights:
-            model.write_json(LIGHTS_FILE, list(self.found_lights))
+        if self.light_rows:
+            model.write_json(LIGHTS_FILE, list(self.light_rows))
         if self.field is not None:
             self.field.save(model)
 

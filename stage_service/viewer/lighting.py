@@ -15,7 +15,7 @@ import numpy as np
 from appearance import Exposure, FittedModel
 from appearance.bsdf.far_field import azimuthal_table
 from appearance.bsdf.lobes import logistic_scale, variances
-from appearance.inverse_rendering.found_lights import lights_as_found
+from appearance.inverse_rendering.fitted_lights import fitted_lights
 from appearance.model.light_sums import (
     LightSums,
     few_lights,
@@ -63,7 +63,7 @@ class Lighting:
     def lights(self) -> list[Light]:
         """The rig's lights that were shot, as a fit found them, or a dome without a capture."""
         if self._capture is not None and (names := self._capture.olat_lights()):
-            return lights_as_found(self._model, [self._capture.rig.light(n) for n in names])
+            return fitted_lights(self._model, [self._capture.rig.light(n) for n in names])
         bright = np.full(3, 10.0)
         places = dome_positions(DOME_LIGHTS, DOME_RADIUS, -60)
         return [Light(f"light_{i:03d}", p, bright) for i, p in enumerate(places)]

@@ -53,7 +53,7 @@ def test_a_volume_is_coloured_before_it_gets_correctives(plain, original):
 @pytest.mark.parametrize(
     ("variant", "killed_in"),
     [
-        ("original", "FitProblem.whole_errors"),
+        ("original", "FitProblem.full_image_errors"),
         pytest.param("correctives", "solve_correctives", marks=pytest.mark.slow),
     ],
 )

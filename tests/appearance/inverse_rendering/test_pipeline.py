@@ -124,7 +124,7 @@ def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
     ]
 
 
-def test_held_out_cameras_are_judged_under_the_lights_as_found(made, tufted, tmp_path, monkeypatch):
+def test_held_out_cameras_are_judged_under_the_fitted_lights(made, tufted, tmp_path, monkeypatch):
     """With the true hair under lights found to be twice as bright, a picture is all wrong."""
     capture, model = made
     other = Model(tmp_path / "model")
@@ -208,12 +208,12 @@ def test_a_fit_that_is_stopped_leaves_what_was_rendered_and_one_that_ends_replac
 @pytest.mark.parametrize(
     ("hair", "doubt"),
     [
-        (HairAppearance((0.06, 0.12, 0.3), 0.93, 0.35), "beta_m 0.93 is beyond 0.05 to 0.8"),
+        (HairAppearance((0.06, 0.12, 0.3), 0.93, 0.35), "beta_m 0.93 lies outside 0.05 to 0.8"),
         (HairAppearance((1.7, 1.7, 1.7), 0.36, 0.3), "beta_m 0.36 may be too rough"),
-        (HairAppearance((0.2, 0.2, 0.2), 0.6, 0.3), "beta_m 0.60 is not what the highlights say"),
+        (HairAppearance((0.2, 0.2, 0.2), 0.6, 0.3), "beta_m 0.60 differs from 0.40"),
     ],
 )
-def test_a_roughness_that_is_not_found_again_is_doubted(made, tmp_path, monkeypatch, hair, doubt):
+def test_a_doubtful_roughness_is_warned_of(made, tmp_path, monkeypatch, hair, doubt):
     """Beyond what is; that of black hair from the grey start of `made`; far from that start."""
     capture, model = made
     other = Model(tmp_path / "model")
@@ -228,7 +228,7 @@ def test_a_roughness_that_is_not_found_again_is_doubted(made, tmp_path, monkeypa
     assert told.startswith(doubt)
 
 
-def test_a_number_that_pictures_say_nothing_of_is_told(made, tmp_path, monkeypatch):
+def test_a_parameter_that_images_do_not_determine_is_warned_of(made, tmp_path, monkeypatch):
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)
@@ -241,7 +241,7 @@ def test_a_number_that_pictures_say_nothing_of_is_told(made, tmp_path, monkeypat
 
     monkeypatch.setattr(pipeline, "run", found)
     (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
-    assert told.startswith("beta_n is not known")
+    assert told.startswith("beta_n is undetermined")
 
 
 def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
@@ -279,7 +279,7 @@ print(before[0], stage.figures["memory_needed_gb"], stage.peak_gb)
 
 
 @pytest.mark.parametrize("copies", [1, 150])
-def test_the_memory_that_is_told_is_what_the_process_takes(made, tmp_path, copies):
+def test_the_predicted_memory_is_what_the_process_takes(made, tmp_path, copies):
     """By the kernel's own account of a process that does nothing else."""
     if str(mi.variant()).startswith("cuda"):
         pytest.skip("what is told is of the CPU: of a GPU's memory the kernel knows nothing")

@@ -23,7 +23,7 @@ from appearance.bsdf.maps import HairMaps
 from appearance.bsdf.parameters import StrandHit
 from appearance.export.groom import at_points
 from appearance.export.maps import export_maps
-from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.fitted_lights import save_lights
 from appearance.model.edit import cut, recoloured, restyled, wisp_of
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import Camera, Model, Rig, read_exr

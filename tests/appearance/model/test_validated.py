@@ -6,7 +6,7 @@ import pytest
 from appearance import Exposure, FittedModel, HairAppearance, HeldOut, InverseRenderingRequest
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import pipeline
-from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.fitted_lights import save_lights
 from appearance.model import validated
 from appearance.model.validated import far_apart, fit_validated
 from appearance.sun_fit.fitted_appearance import FittedAppearance

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from appearance.inverse_rendering.found_lights import save_lights
+from appearance.inverse_rendering.fitted_lights import save_lights
 from reconstruction import Camera, Capture, CaptureWriter, Light, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.lighting import Lighting

@@ -1,4 +1,4 @@
-"""`lights.json`: the lights as inverse rendering found them."""
+"""`lights.json`: the lights with the intensities of inverse rendering."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def save_lights(model: Model, gain: Array, lights: Sequence[Light]) -> None:
     model.write_json(LIGHTS_FILE, rows)
 
 
-def lights_as_found(model: Model, lights: Sequence[Light]) -> list[Light]:
-    """The calibrated `lights` as they were found to be; those that were not fitted as they are.
+def fitted_lights(model: Model, lights: Sequence[Light]) -> list[Light]:
+    """The calibrated `lights` with their fitted intensities, if they were fitted.
 
     Raises `ModelError` for a file that is damaged.
     """
