@@ -59,9 +59,9 @@ class Outcome:
     start, or why there was nothing to fit; `start_error` and `error` are those of full images of
     all pairs, at the start and at the result, under fresh random numbers and alike for both
     (`FitProblem.full_image_errors`). `sure` is the share of random draws of the parts of the hair
-    in which the best result is better than the start (bootstrap): below `SURE`, maps and gain are the
-    start's, and `refused` is the result. `history` holds (seconds, validation error). `left_open`:
-    see `global_parameters.Solved`; empty where no number was solved for.
+    in which the best result is better than the start (bootstrap): below `SURE`, maps and gain are
+    the start's, and `refused` is the result. `history` holds (seconds, validation error).
+    `left_open`: see `global_parameters.Solved`; empty where no number was solved for.
     """
 
     maps: HairMaps

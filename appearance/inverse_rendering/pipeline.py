@@ -145,7 +145,7 @@ def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
     if not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
         doubts.append(
             f"beta_m {found.beta_m:.2f} differs from {start.beta_m:.2f}, measured on "
-            "highlights by Sun's fit: errors of the strands' positions look like roughness in images"
+            "highlights by Sun's fit: errors of the strands' positions look like roughness"
         )
     return doubts
 
