@@ -1,7 +1,7 @@
 """Everything Mitsuba: scenes of hair, renderers, fits of the hair BSDF, image metrics.
 
 Importing it registers the plugin `extended_hair`; a variant may be set before or after.
-The names of `__init__.pyi` are loaded when they are first asked for.
+The names of `__init__.pyi` are loaded on first use.
 """
 
 import reconstruction.libllvm  # noqa: F401, before Mitsuba is imported

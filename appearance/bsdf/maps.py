@@ -21,7 +21,7 @@ from reconstruction.head.scalp_map import ScalpMap, sphere_center
 
 @dataclass(frozen=True, eq=False)
 class HairMaps:
-    """What the extended BSDF of a whole head of hair is told.
+    """The parameters of the extended BSDF over a whole head of hair.
 
     `sigma_a (n_c, w, h, 3)`: absorption per fibre radius; `rotation (n_c, w, h, 2)`: correctives in
     radians about the strand's two transported normals. n_c layers from root to tip, (w, h) cells of

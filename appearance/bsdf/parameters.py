@@ -134,7 +134,7 @@ class HairParameters:
 
 
 class StrandHit:
-    """Where a hit lies, worked out only as far as it is asked for."""
+    """The place of a hit, computed only as far as it is used."""
 
     def __init__(self, strands: dict[str, Any], si: Any, active: Any) -> None:
         self.strands, self.si, self.active = strands, si, active

@@ -53,7 +53,7 @@ class Groom:
     ) -> Groom:
         """The groom of a model, with what its points and its scalp's map say of it.
 
-        `capture` gives the head where none was laid. A model that was never fitted gets the usual
+        `capture` gives the head if the model has none. A model that was never fitted gets the usual
         brown (`FittedModel.unfitted`). Raises `ModelError` naming what is missing.
         """
         made = FittedModel.load if model.has("appearance.json") else FittedModel.unfitted

@@ -1,4 +1,4 @@
-"""What an export can be asked for; light, so that the command line checks it without Mitsuba."""
+"""Options of an export, in a module without Mitsuba: the command line checks them without it."""
 
 from __future__ import annotations
 

@@ -77,8 +77,8 @@ def assess(
     The model is judged as `FittedModel` renders it: with hair maps and lights as found where there
     are any. Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}},
     "held_out_camera": …}`, means over images, each over the captured hair mask. The methods are
-    "ours"; where inverse rendering was run, also "sun_fit" and "inverse_rendering" by themselves
-    ("rendered", beside the groups, names the one that is ours, where a field is, the one below it);
+    "ours"; if that is inverse rendering, also "sun_fit" and "inverse_rendering" by themselves
+    ("rendered", beside the groups, names the fit of the material);
     where a field is on Sun's fit, that "without_field"; and the baselines
 
     - "guided_frames", of held-out lights, no baseline: frames changed as our model says, see
@@ -87,7 +87,7 @@ def assess(
     - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
     - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
       lights, interpolated
-    - "nearest_cameras", of a held-out camera: other cameras' frames laid on our geometry, see
+    - "nearest_cameras", of a held-out camera: other cameras' frames projected on our geometry, see
       `NearestCameras`; left out where there is no other camera, or one of them meets no strand
     - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
       under the three nearest other training lights
@@ -96,7 +96,7 @@ def assess(
     are given (`appearance.metrics.lpips`), and a reason beside the groups where not.
 
     Writes `comparison.png` where there is something to compare (lights: `front_lights`),
-    `relit.png` and `relit.exr` (see `relight`), `relit.webp` where `options.turning_frames` asks
+    `relit.png` and `relit.exr` (see `relight`), `relit.webp` if `options.turning_frames` is above 0
     for it (see `turning_light`), and the stage "images" of the report, which warns of
     every baseline that is not beaten.
     """

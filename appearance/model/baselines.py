@@ -19,7 +19,7 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
 SATURATED = 1e-3  # the weight of what is saturated: it counts where all is
 CAMERAS = 3
-"""Nearest cameras that are asked; lights are three, too."""
+"""Nearest cameras, and nearest lights, that are interpolated."""
 
 
 def three_nearest(

@@ -1,4 +1,4 @@
-"""A fitted model: what renders, relights, edits and exports; every picture goes through it."""
+"""A fitted model: rendered, relit, edited and exported; every picture goes through it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class FittedModel:
     `field` is what the hair reflects beyond that material, None where nothing is known of it.
     `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
     the scalp's map where they are known; they stay with the strands when they move. `rig` is the
-    capture's, its lights as inverse rendering found them; `light_rows` says how, row by row of
-    `lights.json`, empty where they were not fitted.
+    capture's, its lights with fitted intensities; `light_rows` are the rows of `lights.json`,
+    empty if they were not fitted.
     """
 
     strands: Strands
@@ -54,7 +54,7 @@ class FittedModel:
     def load(
         cls, model: Model, capture: Capture | None = None, *, with_field: bool = True
     ) -> FittedModel:
-        """Read a model; `capture` gives the rig, and the head where none was laid.
+        """Read a model; `capture` gives the rig, and the head if the model has none.
 
         Its field is left out unless `with_field`. Raises `ModelError` naming what is missing.
         """

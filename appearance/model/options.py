@@ -1,4 +1,4 @@
-"""What `assess` can be asked for; light, so that a service checks options without Mitsuba."""
+"""Options of `assess`, in a module without Mitsuba: a service checks them without loading it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from reconstruction.options import Count, options
 class AssessOptions:
     """How much is compared: cameras and lights are spread evenly over what is there.
 
-    `turning_frames` of `relit.webp`, the picture under light that turns; 0 leaves it out.
+    `turning_frames` of `relit.webp`, under a rotating environment; 0 leaves it out.
     """
 
     cameras: Count = 2

@@ -1,4 +1,4 @@
-"""How many bounces are worth following, measured: few in dark hair, many in blond."""
+"""How many bounces are needed, measured: few in dark hair, many in blond."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def bounce_limit(
 
     Measured under light that is alike from everywhere, the mean over all places of a light:
     there the light that a path brings is its throughput where it leaves the subject, and no light
-    has to be asked. A light that reaches a pixel only by many bounces may lose a larger share of
+    is sampled. A light that reaches a pixel only by many bounces may lose a larger share of
     its little light. `pixels (P,)` default to those that see the subject; about `paths` paths are
     spent. The largest depth tried is 256. Raises `ValueError` for `share` outside (0, 1).
     """

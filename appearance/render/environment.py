@@ -56,8 +56,8 @@ def render_environment(
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
 
     `rotation_deg` turns the map counter-clockwise seen from above. Pixels off the subject are 0,
-    or the map with `background`. Each vertex of a path asks one direction, drawn in proportion to
-    the map's brightness. Raises `ValueError` for maps that are negative or not finite,
+    or the map with `background`. Each vertex of a path samples one direction, in proportion to the
+    map's brightness. Raises `ValueError` for maps that are negative or not finite,
     `FloatingPointError` where light is not finite.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)

@@ -78,7 +78,7 @@ class KeptPaths:
     """The paths of one camera through P pixels under L lights, `spp` a pixel.
 
     V vertices in order of depth, those of one depth in order of their paths: `path (V,)` numbers
-    the paths, of which path p goes through pixel p mod P. `hair (V,)` tells fibres from skin. Of
+    the paths, of which path p goes through pixel p mod P. `hair (V,)` marks fibres, not skin. Of
     fibres, `strand (V,)` and `along (V,)`, 0 at the root and 1 at the tip, say where they are met,
     `incoming (V, 3)` is the direction towards the camera, `normal (V, 2)` the strand's first normal
     across the fibre, both in the fibre's uncorrected frame. `onward` has one row for each vertex

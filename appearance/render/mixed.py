@@ -70,7 +70,7 @@ def render_mixed(
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject under everything at once.
 
     `weights` broadcasts to `(L, 3)`: a factor for each light and channel, of any sign (a light may
-    be taken away). Every vertex asks one light, drawn in proportion to its mean contribution in a
+    be taken away). Every vertex samples one light, in proportion to its mean contribution in a
     pilot pass, and one direction of each environment. Pixels that do not see the subject are 0.
     Raises `ValueError` naming the fault, `FloatingPointError` where light is not finite.
     """
@@ -121,7 +121,7 @@ def _choice(
     index: Ints,
     sampling: Sampling,
 ) -> Array:
-    """Probabilities `(L,)` of asking each light; none is 0, so nothing is left out for good."""
+    """Probabilities `(L,)` of sampling each light; none is 0, so the estimate is unbiased."""
     if len(lights) < 2:
         return np.ones(len(lights))
     few = index[:: max(1, len(index) // _PILOT)]

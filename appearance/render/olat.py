@@ -152,8 +152,8 @@ def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = Fal
 class _Plan:
     """What is rendered, and how paths and shadow rays are spent.
 
-    `counts`: lights asked at the first and at later vertices. `dim (L,)`: contributions below this
-    radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the light
+    `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
+    this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the light
     of first vertices.
     """
 

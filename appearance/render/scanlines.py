@@ -32,7 +32,7 @@ from reconstruction.options import Count, options
 
 _PILOT = 512  # pixels of the pilot pass
 _PILOT_STREAM = 1 << 31
-_REACH = 4.0  # standard deviations of the line's blur beyond which a row is not asked
+_REACH = 4.0  # standard deviations of the line's blur beyond which a row is skipped
 
 
 @options

@@ -60,7 +60,7 @@ class HairScene:
 
         OptiX answers Mitsuba's `ray_test` by a coarser intersector (NVIDIA's forum, topic 269395),
         by which a ray that passes through the fibre it starts on may meet that fibre's far side:
-        hair lit from behind is 15 to 18 % too dark. On a GPU the nearest hit is asked for instead.
+        hair lit from behind is 15 to 18 % too dark. On a GPU the nearest hit is computed instead.
         """
         if str(mi.variant()).startswith("cuda"):
             return self.mi_scene.ray_intersect_preliminary(ray, False, active).is_valid()
