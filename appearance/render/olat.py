@@ -153,8 +153,8 @@ class _Plan:
     """What is rendered, and how paths and shadow rays are spent.
 
     `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
-    this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the light
-    of first vertices.
+    this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the
+    light of first vertices.
     """
 
     scene: HairScene
