@@ -89,7 +89,7 @@ def fitted(made):
 def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     appearance, _ = fitted
     assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.05)
-    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.04)
+    np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.08)  # of 200 pixels
     np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.03)
     assert appearance.held_out == HeldOut(("cam_2",), ("l5",))
     assert appearance.v == pytest.approx(float(variance_of_roughness(appearance.hair.beta_m)))
