@@ -87,12 +87,20 @@ def own(made, tmp_path):
     return capture, Model(tmp_path / "model")
 
 
-def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
-    capture, model = own
-    shares = []
+@pytest.fixture(scope="module")
+def kept(made, tmp_path_factory):
+    """The model with a field that was kept, what the fit returned, and its progress."""
+    capture, model = made
+    copy, shares = Model(tmp_path_factory.mktemp("kept") / "model"), []
+    shutil.copytree(model.path, copy.path)
     result = fit_field_validated(
-        capture, model, request=REQUEST, progress=lambda what, share: shares.append(share)
+        capture, copy, request=REQUEST, progress=lambda what, share: shares.append(share)
     )
+    return copy, result, shares
+
+
+def test_a_field_that_helps_is_in_every_picture_of_the_model(made, kept):
+    capture, (model, result, shares) = made[0], kept
     assert shares == sorted(shares)
     assert result["rendered"]
     for scores in result["validation"].values():
@@ -113,9 +121,9 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(own):
     assert FittedModel.load(model, capture, with_field=False).field is None
 
 
-def test_edited_hair_keeps_its_field(own, tmp_path):
-    capture, model = own
-    fit_field_validated(capture, model, request=REQUEST)
+def test_edited_hair_keeps_its_field(made, kept, tmp_path):
+    capture, model = made[0], Model(tmp_path / "model")
+    shutil.copytree(kept[0].path, model.path)
     fitted = FittedModel.load(model, capture)
     order = np.random.default_rng(0).permutation(300)
     strands = [fitted.strands.points[8 * k : 8 * k + 8] for k in order]
