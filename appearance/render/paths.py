@@ -1,4 +1,4 @@
-"""What every renderer here shares: camera rays, surface answers, path continuation."""
+"""Shared by all renderers: camera rays, surfaces and their BSDF, random streams."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
 
 @dataclass(frozen=True)
 class Surface:
-    """How the surfaces of `scene` answer light; made once a kernel.
+    """The surfaces of `scene` and their BSDF; made once a kernel.
 
-    With `mean_width` a fibre answers by the mean over half of its width, where its material does.
+    With `mean_width` a fibre scatters the mean over half of its width, if its material can.
     """
 
     scene: HairScene
@@ -141,25 +141,6 @@ def light_from(
     lit = active & (chance * kept < brightest)
     lit &= ~surface.scene.occluded(si.spawn_ray_to(source.position), lit)
     return value * (kept / brightest), lit
-
-
-def continue_path(
-    surface: Surface, si: Any, throughput: Any, rng: Any, roulette: Any, active: Any
-) -> tuple[Any, Any, Any]:
-    """Next ray, throughput and whether it is alive: BSDF sampling and Russian roulette.
-
-    Where `roulette`, survival is the largest channel of the throughput, at most 0.95, and survivors
-    are weighted by its inverse, so that the estimate stays unbiased.
-    """
-    u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-    wo, weight = surface.sample(si, u1, u2, active)
-    throughput = throughput * weight
-    strength = dr.max(throughput)
-    alive = active & (strength > 0)
-    survival = dr.select(roulette, dr.minimum(strength, 0.95), 1)
-    alive &= rng.next_float32() < survival
-    throughput = throughput * dr.select(alive, dr.rcp(survival), 0)
-    return si.spawn_ray(si.to_world(wo)), throughput, alive
 
 
 def pixel_indices(camera: Camera, pixels: ArrayLike) -> Ints:
