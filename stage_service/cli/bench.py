@@ -21,7 +21,7 @@ BENCHMARKS = {
     "console": "a capture and an idle service, beside three open pages, streams of events, nobody",
     "demo": "the demo over subjects and seeds beside its baselines, from runs that were made",
     "exports": "a model opened, rendered and written by Blender, beside ours",
-    "fields": "fields of reflectance beside baselines on new lights and views; their solver",
+    "fields": "fields of reflectance beside baselines on new lights and views",
     "frames": "the simulators' frames beside many paths: error against run time",
     "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
