@@ -64,7 +64,7 @@ class Roughness:
             "Fibres inside a pixel vary more than the reconstructed strands: "
             f"beta_m {self.beta_m:.2g} (95 % interval {self.low:.2g}–{self.high:.2g}) is the "
             "roughness to render these strands with, and may exceed that of a single fibre by a "
-            "third (docs/explanation/inverse_rendering.md)."
+            "third (docs/explanation/sun_fit.md)."
         )
 
     def warnings(self) -> list[str]:
