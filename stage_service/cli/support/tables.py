@@ -158,7 +158,7 @@ def _rows(short: bool = False) -> dict[str, list[_Part]]:
             rows[f"{where}: {title}"] = [(decibels, ".1f", " dB"), (ssim, ".2f", "")]
     rows["β_M to render these strands with"] = [(partial(_beta_m, fit="fitted"), ".2f", "")]
     rows["β_M of Sun's fit: standard error"] = [(_beta_m_error, ".2f", "")]
-    rows["β_M of the true fibres"] = [(partial(_beta_m, fit="true"), ".2f", "")]
+    rows["β_M of the fibres: the truth"] = [(partial(_beta_m, fit="true"), ".2f", "")]
     rows["σ_a, the channel that is furthest off"] = [(_absorption_error, ".0f", " %")]
     return rows
 

@@ -537,7 +537,7 @@ def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
     assert f"| {own} | 21.4 dB / 0.71 |" in rest
     rows = {
         "| β_M to render these strands with | 0.89 |",
-        "| β_M of the true fibres | 0.28 |",
+        "| β_M of the fibres: the truth | 0.28 |",
     }
     assert rows <= set(rest)
     assert rest[-1] == "[1] fit: the roughness is at its bound"
