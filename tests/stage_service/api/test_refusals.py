@@ -22,6 +22,7 @@ from stage_service.config import RigFile
 from stage_service.records import attempts, refusals
 from stage_service.records.attempts import Attempts
 from stage_service.records.audit import Action, AuditLog
+from stage_service.records.lease import Leases
 from stage_service.records.refusals import Refusals
 from stage_service.records.tokens import Tokens
 from stage_service.service import Service
@@ -236,7 +237,7 @@ def test_each_blackout_is_made_while_the_audit_log_hangs(tmp_path, hung, monkeyp
     monkeypatch.setattr(control, "RECORDED_S", 0.05)
     monkeypatch.setattr(control, "MOST_BLACKOUTS", 1)
     made: list[int] = []
-    darkening = Control(AuditLog(tmp_path / "audit.jsonl"))
+    darkening = Control(AuditLog(tmp_path / "audit.jsonl"), Leases(tmp_path / "lease.json"))
 
     def work() -> dict[str, Any]:
         made.append(1)
