@@ -18,25 +18,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
-import numpy as np
 from pydantic import BaseModel
 
-from reconstruction import Capture, MissingFrame, Rig
-from reconstruction.calibration.boards import Board
+from reconstruction import CaptureError, MissingFrame
+from reconstruction.calibration.boards import Board, CalibrationError
 from reconstruction.capture.writer import utc_now
-from reconstruction.images.silhouettes import NoSilhouette, lit_image
 from reconstruction.reading import read_json
 from stage_service.config import RigFile
+from stage_service.decoding import Decoder, Undecodable
 from stage_service.records.events import EventLog
 from stage_service.service_models import BoardSize, CalibrationRequest
 from stage_service.signals import tied
 
-LEAST = 6
-"""Corners that tell a board's pose."""
 LOWER = 10
 """How much lower than the service's the priority of the process is."""
 Point = tuple[float, float]
+ERRORS: dict[str, type[ValueError]] = {
+    **dict.fromkeys(("MissingFrame", "NoSilhouette"), MissingFrame),
+    **dict.fromkeys(("CalibrationError", "RigError"), CalibrationError),
+}
+"""What an error in the decoder is here, by the name of its class."""
 
 
 class BoardView(BaseModel):
@@ -68,8 +69,9 @@ class CalibrationView(BaseModel):
 class Calibrating:
     """One calibration at a time, kept in `root/calibration`; any thread may ask."""
 
-    def __init__(self, folder: Path, rig_file: RigFile, events: EventLog) -> None:
+    def __init__(self, folder: Path, rig_file: RigFile, events: EventLog, decoder: Decoder) -> None:
         self._folder, self._rig_file, self._events = folder, rig_file, events
+        self._decoder = decoder
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._view = CalibrationView(state="none")
@@ -168,48 +170,20 @@ class Calibrating:
         lines = (self._folder / "log").read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it ended without a word"
 
-    def look(self, capture: Capture, camera: str, size: BoardSize, calibrated: bool) -> BoardView:
+    def look(self, capture: Path, camera: str, size: BoardSize, calibrated: bool) -> BoardView:
         """What a camera's lit frame in `capture` shows of the board, by the capture's lens or the
         calibrated one, where there is one of this camera. Raises `MissingFrame`,
-        `CalibrationError`, `RigError`."""
-        lens = nominal = capture.rig.camera(camera)
-        for other in Rig.load(self.rig).cameras if calibrated and self.rig.is_file() else ():
-            if (other.name, other.width, other.height) == (camera, nominal.width, nominal.height):
-                lens = other
+        `CalibrationError`, `CaptureError`, `DecoderBusy`."""
         board = board_of(size)
+        rig = self.rig if calibrated and self.rig.is_file() else None
+        what = board.columns, board.rows, board.square, board.marker, board.dictionary
         try:
-            seen = board.find(lit_image(capture, camera))
-        except NoSilhouette as error:
-            raise MissingFrame(str(error)) from error
-        view = BoardView(
-            corners=len(seen),
-            of=len(board.corners),
-            pixels=_points(seen.pixels),
-            lens="nominal" if lens is nominal else "calibrated",
-        )
-        flat = board.corners[seen.ids]
-        if len(seen) < LEAST or np.linalg.matrix_rank(flat - flat.mean(axis=0), 1e-6) < 2:
-            return view
-        how = lens.K, lens.distortion
-        found, turn, shift = cv2.solvePnP(flat, seen.pixels, *how, flags=cv2.SOLVEPNP_IPPE)
-        if not found:
-            return view
-        turn, shift = cv2.solvePnPRefineLM(flat, seen.pixels, *how, turn, shift)
-        off = cv2.projectPoints(flat, turn, shift, *how)[0].reshape(-1, 2) - seen.pixels
-        upright = abs(float(cv2.Rodrigues(turn)[0][2, 2]))
-        told = {
-            "off": _points(off),
-            "rms_px": float(np.sqrt((off**2).sum(axis=1).mean())),
-            "tilt_deg": float(np.degrees(np.arccos(min(1.0, upright)))),
-        }
-        return view.model_copy(update=told)
+            return BoardView.model_validate(self._decoder.board(capture, camera, what, rig))
+        except Undecodable as error:
+            raise ERRORS.get(error.kind, CaptureError)(str(error)) from error
 
 
 def board_of(size: BoardSize) -> Board:
     """The board. Raises `CalibrationError` where there can be none."""
     square, marker = 1e-3 * size.square_mm, 1e-3 * size.marker_mm
     return Board(size.columns, size.rows, square, marker, size.dictionary)
-
-
-def _points(array: Any) -> list[Point]:
-    return [(round(float(x), 3), round(float(y), 3)) for x, y in array]

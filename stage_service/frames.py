@@ -6,10 +6,33 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from pydantic import BaseModel, ConfigDict
+
 from reconstruction import Capture, CaptureError
 from stage_service.service_models import StepView
 
 T = TypeVar("T")
+
+
+class FrameFigures(BaseModel):
+    """How a frame is exposed. `white`: the 99.5 % quantile of its values, W/(sr m²); `saturated`:
+    the share of its pixels of which a channel is at `full_scale` (None: it never saturates).
+
+    `histogram` counts values in 64 equal bins from 0 to full scale, or to the largest value.
+    `focus` is the variance of the green channel's Laplacian by the square of its mean: it is at its
+    largest where the picture is sharpest, and compares frames of one camera in one light.
+    """
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    width: int
+    height: int
+    largest: float
+    white: float
+    full_scale: float | None
+    saturated: float
+    histogram: list[int]
+    focus: float
 
 
 class UnknownFrame(LookupError):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from appearance.model.relight import PROCEDURAL
-from reconstruction import Mesh, Rig, read_obj
+from reconstruction import Mesh, Rig
 from reconstruction.arrays import Bools
 from reconstruction.containment import plain_file
-from reconstruction.files.masks import read_mask
 from stage_service.captures.snapshots import SNAPSHOT
+from stage_service.decoding import Decoder
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.records import PipelineRequest
 
@@ -18,21 +18,23 @@ class BadInput(ValueError):
     """A file that a request names cannot be used; the message names it and says why."""
 
 
-def read_head(path: Path) -> Mesh:
-    """The head of an OBJ file. Raises `BadInput`."""
+def read_head(path: Path, decoder: Decoder) -> Mesh:
+    """The head of an OBJ file. Raises `BadInput`, `DecoderBusy`."""
     try:
-        return read_obj(path)
+        return decoder.head(plain_file(path), str(path))
     except (OSError, ValueError) as error:
         raise BadInput(f"head: {error}") from error
 
 
-def read_masks(folder: Path, rig: Rig) -> dict[str, Bools]:
-    """The masks `<camera>.png` of the rig's cameras, `(height, width)` each. Raises `BadInput`."""
+def read_masks(folder: Path, rig: Rig, decoder: Decoder) -> dict[str, Bools]:
+    """The masks `<camera>.png` of the rig's cameras, `(height, width)` each. Raises `BadInput`,
+    `DecoderBusy`."""
     masks = {}
     for camera in rig.cameras:
         path = folder / f"{camera.name}.png"
         try:
-            masks[camera.name] = read_mask(path, camera.width, camera.height)
+            size = camera.width, camera.height
+            masks[camera.name] = decoder.mask(plain_file(path), str(path), *size)
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:

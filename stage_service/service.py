@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 from reconstruction import Capture, CaptureError
 from reconstruction.calibration.boards import CalibrationError
 from reconstruction.containment import inside, is_file_name
-from reconstruction.geometry.rig import RigError
 from stage_service.acquisition.states import CaptureStatus, Outcome
 from stage_service.calibrating import BoardView, Calibrating, CalibrationView
 from stage_service.captures.catalogue import UnknownCapture
@@ -23,7 +22,8 @@ from stage_service.captures.manager import CaptureManager
 from stage_service.captures.may_light import Moment, Word
 from stage_service.captures.snapshots import SNAPSHOT, one_step
 from stage_service.config import RigFile
-from stage_service.frames import UnknownFrame, read_frame, steps_of
+from stage_service.decoding import Decoder
+from stage_service.frames import FrameFigures, UnknownFrame, read_frame, steps_of
 from stage_service.inputs import BadInput, check_kept, check_new, read_head, read_masks
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue, NoSuchJob
@@ -94,8 +94,11 @@ class Service:
         self.leasing = Leasing(self._control, self.events)
         self.refusals = Refusals(self._captures.audit)
         self.watching = Watching(root, self._captures, self._queue, self._follower)
-        self.storage = Storage(root, self._captures, self._control, self._queue)
-        self.viewing = Viewing(lambda: [m.name for m in self.storage.models()], self._viewed)
+        self.decoder = Decoder()
+        self.storage = Storage(root, self._captures, self._control, self._queue, self.decoder)
+        self.viewing = Viewing(
+            lambda: [m.name for m in self.storage.models()], self._viewed, self.decoder
+        )
         self._verifier = Verifier(
             root / "verified.json",
             self._captures.events,
@@ -103,7 +106,7 @@ class Service:
             lambda: [c for c in self._captures.list() if c.outcome == "completed"],
             verify_days,
         )
-        self.calibrating = Calibrating(root / "calibration", rig_file, self.events)
+        self.calibrating = Calibrating(root / "calibration", rig_file, self.events, self.decoder)
         self._closing = threading.Lock()
         self._closed = threading.Event()
 
@@ -165,6 +168,7 @@ class Service:
                 self._closed.set()
         self.refusals.close()
         self._control.audit.flush(FLUSH_S)
+        self.decoder.close()
         self._follower.close()
         self._queue.close()
 
@@ -195,8 +199,10 @@ class Service:
             check_new(request.pipeline, self.rig_file.rig, given is not None)
         head = None
         if given is not None:
-            head = read_head(given)
-        masks = read_masks(folder, self.rig_file.rig) if folder is not None else None
+            head = read_head(given, self.decoder)
+        masks = None
+        if folder is not None:
+            masks = read_masks(folder, self.rig_file.rig, self.decoder)
         asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
 
         def start(word: Word, **more: str) -> str:
@@ -269,6 +275,18 @@ class Service:
         """
         return read_frame(Capture(self.capture_path(capture_id)), step, camera, read)
 
+    def preview(self, capture_id: str, step: int, camera: str, **look: Any) -> bytes:
+        """A PNG of a frame, as `png_of_frame` makes it. Raises as `frame`, and `DecoderBusy`."""
+        return self.frame(capture_id, step, camera, partial(self.decoder.preview, **look))
+
+    def figures(self, capture_id: str, step: int, camera: str) -> FrameFigures:
+        """How a frame is exposed. Raises as `frame`, and `DecoderBusy`."""
+
+        def read(file: Path) -> FrameFigures:
+            return FrameFigures.model_validate(self.decoder.figures(file))
+
+        return self.frame(capture_id, step, camera, read)
+
     def steps(self, capture_id: str) -> list[StepView]:
         """What a capture shoots, in order, and which frames it has. Raises `UnknownCapture`,
         `CaptureError`."""
@@ -280,8 +298,8 @@ class Service:
         if camera not in [c.name for c in capture.rig.cameras]:
             raise UnknownFrame(f"{capture_id} has no camera {camera!r}")
         try:
-            return self.calibrating.look(capture, camera, board, board.calibrated)
-        except (CalibrationError, RigError) as error:
+            return self.calibrating.look(capture.path, camera, board, board.calibrated)
+        except CalibrationError as error:
             raise BadInput(str(error)) from error
 
     def calibrate(self, request: CalibrationRequest, by: Caller) -> CalibrationView:

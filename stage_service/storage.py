@@ -10,7 +10,6 @@ import fcntl
 import logging
 import secrets
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,14 +20,14 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction import Model, Rig, read_obj
+from reconstruction import Model, Rig
 from reconstruction.capture.writer import JournalInUse, utc_now
 from reconstruction.containment import inside, is_file_name
 from reconstruction.files.durable import flush, require_free, write_json, write_whole
-from reconstruction.files.masks import decode_mask
 from reconstruction.reading import read_json
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import CaptureManager
+from stage_service.decoding import Decoder, Undecodable
 from stage_service.jobs.queue import JobQueue
 from stage_service.jobs.records import Job
 
@@ -82,9 +81,15 @@ class Storage:
     """
 
     def __init__(
-        self, root: Path, captures: CaptureManager, control: Control, jobs: JobQueue
+        self,
+        root: Path,
+        captures: CaptureManager,
+        control: Control,
+        jobs: JobQueue,
+        decoder: Decoder,
     ) -> None:
         self._root, self._captures, self._control, self._jobs = root, captures, control, jobs
+        self._decoder = decoder
         self._trash, self._uploads = root / "trash", root / "uploads"
         self._uploading = threading.Lock()  # a file has one temporary name
         self._emptying = threading.Lock()  # what is being deleted must not be restored
@@ -212,28 +217,25 @@ class Storage:
         return [_listed(p) for p in found if p.is_dir() and is_file_name(p.name)]
 
     def upload_head(self, subject: str, data: bytes, by: Caller) -> Folder:
-        """Keep a digitised head (OBJ). Raises `BadUpload`, `DiskFull`."""
-        with tempfile.NamedTemporaryFile(suffix=".obj") as scratch:
-            scratch.write(data)
-            scratch.flush()
-            try:
-                read_obj(scratch.name)
-            except (OSError, ValueError) as error:
-                why = str(error).replace(scratch.name, "head.obj")
-                raise BadUpload(f"head.obj: {why}") from error
+        """Keep a digitised head (OBJ). Raises `BadUpload`, `DecoderBusy`, `DiskFull`."""
+        try:
+            self._decoder.head(data, "head.obj")
+        except Undecodable as error:
+            raise BadUpload(str(error)) from error
         return self._upload(subject, "head.obj", data, by)
 
     def upload_mask(self, subject: str, camera: str, data: bytes, rig: Rig, by: Caller) -> Folder:
         """Keep a hair mask (PNG, as large as the camera's frames). Raises `BadUpload`,
-        `DiskFull`."""
+        `DecoderBusy`, `DiskFull`."""
         known = {c.name: c for c in rig.cameras}
         if camera not in known:
             raise BadUpload(f"masks: the rig has no camera {camera!r}; it has {sorted(known)}")
+        name = f"masks/{camera}.png"
         try:
-            decode_mask(data, known[camera].width, known[camera].height)
-        except ValueError as error:
-            raise BadUpload(f"masks/{camera}.png: {error}") from error
-        return self._upload(subject, f"masks/{camera}.png", data, by)
+            self._decoder.mask(data, name, known[camera].width, known[camera].height)
+        except Undecodable as error:
+            raise BadUpload(str(error)) from error
+        return self._upload(subject, name, data, by)
 
     def uploaded(self, subject: str) -> tuple[Path | None, Path | None]:
         """Head and folder of masks of a subject, where there are any. Raises `NotThere`."""

@@ -56,7 +56,6 @@ from stage_service.captures.hold import Hold
 from stage_service.captures.latch import Latch
 from stage_service.captures.status_index import StatusIndex
 from stage_service.config import load_rig_file
-from stage_service.inputs import read_masks
 from stage_service.jobs.records import PipelineRequest
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.records.audit import AuditLog
@@ -215,7 +214,6 @@ def _mask(folder: Path) -> tuple[Path, Callable[[Path], Any]]:
     capture = Capture(_capture(folder))
 
     def read(file: Path) -> None:
-        read_masks(folder, capture.rig)
         capture.read_mask(file, "cam_0")
 
     return folder / "cam_0.png", read

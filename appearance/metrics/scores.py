@@ -17,15 +17,10 @@ from scipy.ndimage import correlate1d
 
 from appearance.metrics import lpips
 from reconstruction.arrays import AnyFloats, Array, Bools
+from reconstruction.images.srgb import srgb as srgb
 
 _WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 _WINDOW /= _WINDOW.sum()
-
-
-def srgb(linear: ArrayLike) -> Array:
-    """The sRGB curve (IEC 61966-2-1) on values of any shape, clipped to [0, 1]."""
-    x = np.clip(np.asarray(linear, float), 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ BRIGHTEST = 1e25
 """Radiance, or a light's intensity, up to which sums over paths stay finite in float32."""
 
 
-def load_environment(path: str | Path) -> Floats:
-    """Read a lat-long map `(h, w, 3)`, scene-linear RGB, from Radiance `.hdr` or OpenEXR `.exr`.
+def load_environment(path: str | Path, kind: str | None = None) -> Floats:
+    """Read a lat-long map `(h, w, 3)`, scene-linear RGB, from Radiance `.hdr` or OpenEXR `.exr`;
+    `kind` is "hdr" or "exr" where the path does not end so.
 
     Raises `ValueError` that names the file when it is absent, of another kind, negative or not
     finite.
@@ -23,9 +24,10 @@ def load_environment(path: str | Path) -> Floats:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such environment map")
-    if path.suffix.lower() == ".exr":
+    kind = kind or path.suffix.lower().removeprefix(".")
+    if kind == "exr":
         return check_environment(read_exr(path)[0], str(path))
-    if path.suffix.lower() != ".hdr":
+    if kind != "hdr":
         raise ValueError(f"{path}: an environment map must be .hdr or .exr")
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.dtype != np.float32:

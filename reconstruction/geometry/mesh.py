@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.containment import plain_file
 from reconstruction.geometry.strands import unit_or_zero
+
+LONGEST_LINE = 1 << 16
+"""Characters of an OBJ file's line: a polygon of some thousand corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +65,18 @@ class Mesh:
         return np.cross(b - a, c - a)
 
 
-def read_obj(path: str | Path) -> Mesh:
+def read_obj(path: str | Path, most: int | None = None) -> Mesh:
     """Read the triangles of a Wavefront OBJ; polygons are fanned.
 
     Faces in a group, object or material whose name contains "scalp" are marked as scalp; without
     such a name `scalp` is None. Raises `OSError`, and `ValueError` naming the file where it holds
-    no triangles, is no text, no regular file or has more than 256 MiB.
+    no triangles or more than `most`, is no text, no regular file or has more than 256 MiB.
     """
-    try:
-        text = plain_file(path).read_text()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is no Wavefront OBJ: {error}") from error
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
     scalp: list[bool] = []
     in_scalp = {"g": False, "o": False, "usemtl": False}
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in _lines(plain_file(path)):
         words = line.split()
         if not words:
             continue
@@ -93,6 +94,11 @@ def read_obj(path: str | Path) -> Mesh:
                 in_scalp[words[0]] = "scalp" in " ".join(words[1:]).lower()
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}") from error
+        if most is not None and max(len(faces), len(vertices)) > most:
+            raise ValueError(
+                f"{path}: more than {most:,} triangles or vertices; at most {most:,} are read: "
+                "make the mesh coarser"
+            )
     if not faces:
         raise ValueError(f"{path}: no faces; expected a triangle mesh in Wavefront OBJ")
     try:
@@ -101,12 +107,40 @@ def read_obj(path: str | Path) -> Mesh:
         raise ValueError(f"{path}: {error}") from error
 
 
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text and their numbers. Raises `ValueError` naming the file."""
+    number = 0
+    with path.open() as file:
+        try:
+            while line := file.readline(LONGEST_LINE + 1):
+                number += 1
+                if len(line) > LONGEST_LINE and line.startswith("#"):
+                    while line and not line.endswith("\n"):
+                        line = file.readline(LONGEST_LINE)
+                elif len(line) > LONGEST_LINE:
+                    raise ValueError(
+                        f"{path}, line {number}: more than {LONGEST_LINE:,} characters; a face has "
+                        "a few corners"
+                    )
+                else:
+                    yield number, line
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path} is no Wavefront OBJ: {error}") from error
+
+
 def write_obj(path: str | Path, mesh: Mesh) -> None:
     """Write a Wavefront OBJ; marked scalp faces go into a group called `scalp`."""
     scalp = mesh.scalp if mesh.scalp is not None else np.zeros(len(mesh.faces), bool)
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices]
-    for name, which in (("head", ~scalp), ("scalp", scalp)):
-        if which.any():
-            lines.append(f"g {name}")
-            lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces[which] + 1]
-    Path(path).write_text("\n".join(lines) + "\n")
+    with Path(path).open("w") as file:
+        for block in _blocks(mesh.vertices):
+            file.writelines(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in block)
+        for name, which in (("head", ~scalp), ("scalp", scalp)):
+            if which.any():
+                file.write(f"g {name}\n")
+                for block in _blocks(mesh.faces[which] + 1):
+                    file.writelines(f"f {a} {b} {c}\n" for a, b, c in block)
+
+
+def _blocks(rows: NDArray[Any]) -> Iterator[list[Any]]:
+    """Rows as Python numbers, some at a time: all at once would take many times their memory."""
+    return (rows[i : i + 65536].tolist() for i in range(0, len(rows), 65536))

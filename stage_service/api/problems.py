@@ -30,6 +30,7 @@ from stage_service.captures.control import Forbidden
 from stage_service.captures.hold import HoldChanged
 from stage_service.captures.latch import CannotAcknowledge, Unsafe
 from stage_service.captures.may_light import Busy, NotNow
+from stage_service.decoding import DecoderBusy, Undecodable
 from stage_service.devices.device_set import NoStage
 from stage_service.devices.ownership import StageInUse
 from stage_service.devices.permission import NotPermitted
@@ -81,7 +82,8 @@ invalid-plan 422 This rig cannot shoot this plan
     `problems` has one sentence for each reason. No lamp was touched. Correct the plan and try
     it with `POST /plans:validate`.
 bad-input 422 A file or name in the request cannot be used
-    `detail` names it and says what was expected. Paths are those of the service's machine.
+    `detail` names it and says what was expected, or which limit it goes beyond. Paths are those of
+    the service's machine.
 busy 409 Another capture is running
     The stage makes one capture at a time. Wait for `running`, or abort it.
 not-now 409 Light may not be put on now
@@ -150,6 +152,9 @@ unknown-artifact 404 No such file in the model folder
 jobs-unavailable 503 The job database does not answer
     Captures, blackout and abort do not need it. `GET /health` says what is wrong; what
     completed captures were asked to be followed by is enqueued once it answers.
+decoder-busy 503 Other files are being decoded
+    Pictures, meshes and maps are decoded in a process of its own, a few at a time. Ask again in
+    some seconds.
 not-ready 503 No capture could begin
     `problems` has a sentence for each reason. A capture that runs is none.
 damaged-capture 409 The capture folder cannot be read
@@ -177,6 +182,8 @@ BY_ERROR: dict[type[Exception], str] = {
     BadInput: "bad-input",
     BadUpload: "bad-input",
     BadLight: "bad-input",
+    Undecodable: "bad-input",
+    DecoderBusy: "decoder-busy",
     InUse: "in-use",
     NotThere: "not-there",
     NothingToView: "not-there",

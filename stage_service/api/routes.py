@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -13,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 
 from stage_service.acquisition.states import Outcome
 from stage_service.api.downloads import RANGES, bytes_response, file_response
-from stage_service.api.frames import FrameFigures, figures_of, png_preview
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
+from stage_service.frames import FrameFigures
 from stage_service.jobs.records import Job
 from stage_service.model_page.page import PAGE
 from stage_service.plan.capture_plan import CapturePlan
@@ -142,15 +141,15 @@ def get_preview(
 ) -> Response:
     """A picture of a frame to look at: exposed by a percentile, or by what is said to be white, so
     that frames can be compared; sRGB, made smaller where `size` says so."""
-    look = partial(png_preview, percentile=percentile, white=white, size=size, mark=mark)
-    picture = service.frame(capture, step, camera, look)
+    look = {"percentile": percentile, "white": white, "size": size, "mark": mark}
+    picture = service.preview(capture, step, camera, **look)
     return Response(picture, media_type="image/png")
 
 
 @reading.get("/captures/{capture}/frames/{step}/{camera}.json", tags=["captures"])
 def get_figures(capture: str, step: int, camera: str, service: OnService) -> FrameFigures:
     """How a frame is exposed, and how sharp it is."""
-    return service.frame(capture, step, camera, figures_of)
+    return service.figures(capture, step, camera)
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from reconstruction import Camera
+from reconstruction.arrays import Array
 from stage_service.api.downloads import file_response
 from stage_service.api.gate import VIEW, VIEW_PAGE
 from stage_service.api.steering import READS, caller
@@ -212,18 +213,30 @@ def get_environment(
     model: OnModel, which: str, rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0
 ) -> dict[int, list[float]]:
     """By what each light is multiplied to stand for the map "studio" or "sky"."""
-    return model.lighting.environment(which, "", rotation_deg)
+    return _lit(model.lighting.environment(which, rotation_deg))
 
 
 @router.put("/{name}/environments/{file}", openapi_extra=MAP)
 async def put_environment(
     model: OnModel,
+    viewing: OnViewing,
     file: str,
     request: Request,
     rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0,
 ) -> dict[int, list[float]]:
-    """By what each light is multiplied to stand for this .hdr or .exr map. It is not kept."""
+    """By what each light is multiplied to stand for this .hdr or .exr map, of at most 4096 × 2048
+    pixels. It is not kept."""
     data, kind = await request.body(), file.rpartition(".")[2].lower()
-    return await run_in_threadpool(
-        lambda: model.lighting.environment(data, kind, rotation_deg),
-    )
+    if kind not in ("hdr", "exr"):
+        raise BadLight(f"an environment map must be .hdr or .exr, got {kind!r}")
+
+    def work() -> dict[int, list[float]]:
+        lights = model.lighting.lights
+        return _lit(viewing.decoder.map_weights(data, file, kind, rotation_deg, lights))
+
+    return await run_in_threadpool(work)
+
+
+def _lit(weights: Array) -> dict[int, list[float]]:
+    """The `weights (L, 3)` of the lights that have any, by their numbers."""
+    return {i: w.tolist() for i, w in enumerate(weights) if w.any()}

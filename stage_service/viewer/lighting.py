@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections import OrderedDict
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,7 +22,6 @@ from appearance.model.light_sums import (
     weights_of_environment,
 )
 from appearance.model.relight import PROCEDURAL
-from appearance.render.environment_maps import load_environment
 from appearance.render.visibility import above_faces, reached, within_fibres
 from reconstruction import Camera, Capture, Light, Model
 from reconstruction.arrays import Array
@@ -210,27 +207,12 @@ class Lighting:
     def _scene(self) -> Any:
         return self.fitted.without_field().scene()
 
-    def environment(
-        self, what: str | bytes, kind: str, rotation_deg: float
-    ) -> dict[int, list[float]]:
-        """What each light is multiplied by under a map: "studio", "sky", or the bytes of an .hdr or
-        .exr file. Raises `BadLight`."""
-        if isinstance(what, str):
-            if what not in PROCEDURAL:
-                raise BadLight(f"there is no environment {what!r}: {', '.join(PROCEDURAL)}")
-            image = PROCEDURAL[what]()
-        else:
-            if kind not in ("hdr", "exr"):
-                raise BadLight(f"an environment map must be .hdr or .exr, got {kind!r}")
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder) / f"map.{kind}"
-                file.write_bytes(what)
-                try:
-                    image = load_environment(file)
-                except (ValueError, OSError) as error:
-                    raise BadLight(f"the map cannot be read: {error}") from error
-        weights = weights_of_environment(self.lights, image, rotation_deg)
-        return {i: w.tolist() for i, w in enumerate(weights) if w.any()}
+    def environment(self, which: str, rotation_deg: float) -> Array:
+        """What each light is multiplied by under the map "studio" or "sky", `(L, 3)`. Raises
+        `BadLight`."""
+        if which not in PROCEDURAL:
+            raise BadLight(f"there is no environment {which!r}: {', '.join(PROCEDURAL)}")
+        return weights_of_environment(self.lights, PROCEDURAL[which](), rotation_deg)
 
     def sum(self, camera: str, weights: dict[int, list[float]], exposure: float) -> bytes:
         """A PNG of `camera`'s frames under lights (number: RGB): their sum, times `exposure`, in

@@ -6,16 +6,23 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 
+from stage_service.decoding import Decoder
 from stage_service.viewer.viewed import Viewed
 
 KEPT = 2
 
 
 class Viewing:
-    """Models by name: `names` lists them, `open_model` reads one (or raises `LookupError`)."""
+    """Models by name: `names` lists them, `open_model` reads one (or raises `LookupError`);
+    `decoder` is for maps that they are lit by."""
 
-    def __init__(self, names: Callable[[], list[str]], open_model: Callable[[str], Viewed]) -> None:
-        self.names, self._open = names, open_model
+    def __init__(
+        self,
+        names: Callable[[], list[str]],
+        open_model: Callable[[str], Viewed],
+        decoder: Decoder,
+    ) -> None:
+        self.names, self._open, self.decoder = names, open_model, decoder
         self._kept: OrderedDict[str, tuple[object, Viewed]] = OrderedDict()
         self._lock = threading.Lock()
 

@@ -31,6 +31,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     from stage_service.api.app import serve_viewer
     from stage_service.api.gate import Access
     from stage_service.cli.stage.processes import exit_on_sigterm
+    from stage_service.decoding import Decoder
     from stage_service.records.tokens import Tokens
     from stage_service.viewer import Viewed, Viewing
 
@@ -43,7 +44,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     capture = None if args.capture is None else Capture(args.capture)
     truth = None if args.truth is None else read_strands(args.truth)
     name = args.model.resolve().name
-    viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth))
+    decoder = Decoder()
+    viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth), decoder)
     viewing.get(name).about()  # read now: the browser then waits for nothing
     key = secrets.token_urlsafe(24)
 
@@ -53,4 +55,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     exit_on_sigterm()
     access = Access(Tokens(args.model / "none", key))  # a key for this run alone
-    serve_viewer(viewing, access, args.port, ready)
+    try:
+        serve_viewer(viewing, access, args.port, ready)
+    finally:
+        decoder.close()

@@ -20,6 +20,7 @@ from reconstruction.calibration.boards import Board
 from simulators.subject.props import PropResponder, board_pose
 from stage_service.calibrating import Calibrating
 from stage_service.config import load_rig_file
+from stage_service.decoding import Decoder
 from stage_service.records.events import EventLog
 from stage_service.service_models import CalibrationRequest
 
@@ -123,7 +124,7 @@ def test_one_whose_rig_cannot_be_put_in_its_place_has_failed(nominal, tmp_path, 
     monkeypatch.setattr("sys.executable", "/bin/true")  # ends well, and leaves nothing behind
     (tmp_path / "nominal.json").write_text(json.dumps(nominal.to_dict()))
     rig_file = load_rig_file(tmp_path / "nominal.json")
-    one = Calibrating(tmp_path / "calibration", rig_file, EventLog())
+    one = Calibrating(tmp_path / "calibration", rig_file, EventLog(), Decoder())
     one.begin(CalibrationRequest(boards=["pose"]), lambda _: tmp_path)
     until(lambda: one.view().state != "running")
     assert one.view().state == "failed"
@@ -136,11 +137,12 @@ import os, signal, sys, time
 from pathlib import Path
 from stage_service.calibrating import Calibrating
 from stage_service.config import load_rig_file
+from stage_service.decoding import Decoder
 from stage_service.records.events import EventLog
 from stage_service.service_models import CalibrationRequest
 
 root = Path(sys.argv[1])
-one = Calibrating(root / "calibration", load_rig_file(root / "nominal.json"), EventLog())
+one = Calibrating(root / "calibration", load_rig_file(root / "nominal.json"), EventLog(), Decoder())
 one.begin(CalibrationRequest(boards=["pose"]), lambda _: root / "pose")
 child = one._process.pid
 words = Path(f"/proc/{child}/cmdline")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import httpx
@@ -13,6 +14,7 @@ from serving import listening_app
 from reconstruction import Mesh, Model, Strands
 from stage_service.api.app import create_viewer
 from stage_service.api.gate import Access
+from stage_service.decoding import Decoder
 from stage_service.records.tokens import Tokens
 from stage_service.viewer import NothingToView, Viewed, Viewing
 
@@ -55,13 +57,19 @@ def bristly(tmp_path: Path) -> Model:
 
 
 @pytest.fixture
-def viewing(model: Model) -> Viewing:
+def decoder() -> Iterator[Decoder]:
+    with closing(Decoder()) as decoder:
+        yield decoder
+
+
+@pytest.fixture
+def viewing(model: Model, decoder: Decoder) -> Viewing:
     def opened(name: str) -> Viewed:
         if name != "bristles":
             raise NothingToView(f"there is no model {name!r}")
         return Viewed(model, truth=bristles(seed=1))
 
-    return Viewing(lambda: ["bristles"], opened)
+    return Viewing(lambda: ["bristles"], opened, decoder)
 
 
 @pytest.fixture

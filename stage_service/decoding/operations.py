@@ -1,0 +1,144 @@
+"""What is decoded, and how: each operation takes a file and gives JSON and bytes.
+
+Run in the decoder's process alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from reconstruction.containment import plain_file
+from reconstruction.files.exr import read_exr
+from reconstruction.files.masks import read_mask
+from reconstruction.geometry.mesh import read_obj
+from stage_service.decoding.frame_pictures import frame_figures, png_of_frame
+from stage_service.decoding.framing import Part
+from stage_service.decoding.limits import (
+    MOST_CHANNELS,
+    MOST_FRAME_PIXELS,
+    MOST_MAP_PIXELS,
+    MOST_TRIANGLES,
+)
+
+Answer = tuple[dict[str, Any], list[Part]]
+_RADIANCE_SIZE = re.compile(rb"\n\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n")
+_RADIANCE_HEADER = 1 << 16
+"""Bytes in which a Radiance file's sizes are looked for."""
+
+
+def preload() -> None:
+    """Load what forks need, but for the renderer: only maps need that, and it starts threads."""
+    from stage_service.decoding import board_views  # noqa: F401
+
+    cv2.setNumThreads(1)
+
+
+def preview(file: Path, **look: Any) -> Answer:
+    """A PNG of a frame."""
+    _check_exr(file, MOST_FRAME_PIXELS)
+    return {}, [png_of_frame(*read_exr(file), **look)]
+
+
+def figures(file: Path) -> Answer:
+    """How a frame is exposed."""
+    _check_exr(file, MOST_FRAME_PIXELS)
+    return {"figures": frame_figures(*read_exr(file))}, []
+
+
+def head(file: Path) -> Answer:
+    """The triangles of an OBJ: vertices, faces, and which of them are scalp, where it says so."""
+    mesh = read_obj(file, MOST_TRIANGLES)
+    arrays = [mesh.vertices, mesh.faces]
+    return _arrays(*arrays, *([] if mesh.scalp is None else [mesh.scalp]))
+
+
+def mask(file: Path, width: int, height: int) -> Answer:
+    """Where a grey PNG of that size is half grey and above."""
+    return _arrays(read_mask(file, width, height))
+
+
+def map_weights(
+    file: Path, kind: str, rotation_deg: float, positions: list[Any], intensities: list[Any]
+) -> Answer:
+    """What each light is multiplied by to stand for an environment map of the `kind` "hdr" or
+    "exr"; lights are at `positions (L, 3)` and send `intensities (L, 3)` to the origin."""
+    from appearance.model.light_sums import weights_of_environment
+    from appearance.render.environment_maps import load_environment
+    from reconstruction import Light
+
+    if kind == "exr":
+        _check_exr(file, MOST_MAP_PIXELS)
+    else:
+        _check_radiance(file, MOST_MAP_PIXELS)
+    lights = [
+        Light(f"light {i}", np.array(p), np.array(power))
+        for i, (p, power) in enumerate(zip(positions, intensities, strict=True))
+    ]
+    image = load_environment(file, kind)
+    return _arrays(weights_of_environment(lights, image, rotation_deg))
+
+
+def board(file: Path, **asked: Any) -> Answer:
+    """What a camera's lit frame in the capture at `file` shows of a board."""
+    from stage_service.decoding.board_views import board_view
+
+    return {"board": board_view(file, **asked)}, []
+
+
+OPERATIONS: dict[str, Callable[..., Answer]] = {
+    f.__name__: f for f in (preview, figures, head, mask, map_weights, board)
+}
+
+
+def _arrays(*arrays: NDArray[Any]) -> Answer:
+    whole = [np.ascontiguousarray(a) for a in arrays]
+    told = [{"dtype": a.dtype.str, "shape": a.shape} for a in whole]
+    return {"arrays": told}, [memoryview(a).cast("B") if a.size else b"" for a in whole]
+
+
+def _check_exr(file: Path, most: int) -> None:
+    """Raise `ValueError` where an OpenEXR file unpacks to more than `most` pixels."""
+    plain_file(file)
+    try:
+        parts = OpenEXR.File(str(file), header_only=True).parts
+        sizes = [_size(part.header) for part in parts]
+    except Exception as error:  # the binding raises what it likes
+        raise ValueError(f"{file}: cannot be read as OpenEXR ({error})") from error
+    for width, height, channels in sizes:
+        check_size(file, width, height, most)
+        if channels > MOST_CHANNELS:
+            raise ValueError(f"{file}: {channels} channels; at most {MOST_CHANNELS} are read")
+    if len(sizes) > 1:
+        raise ValueError(f"{file}: {len(sizes)} parts; write the picture alone")
+
+
+def _size(header: dict[str, Any]) -> tuple[int, int, int]:
+    low, high = header["dataWindow"]
+    width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+    return width, height, len(header["channels"])
+
+
+def _check_radiance(file: Path, most: int) -> None:
+    """The same of a Radiance file."""
+    with plain_file(file).open("rb") as opened:
+        found = _RADIANCE_SIZE.search(opened.read(_RADIANCE_HEADER))
+    if found is None:
+        raise ValueError(f"{file}: cannot be read as a Radiance .hdr image: it has no size")
+    first, second = (int(n) for n in found.groups())
+    check_size(file, second, first, most)
+
+
+def check_size(file: Path, width: int, height: int, most: int) -> None:
+    """Raise `ValueError` for more than `most` pixels."""
+    if width < 1 or height < 1 or width * height > most:
+        raise ValueError(
+            f"{file}: the picture unpacks to {width} × {height} pixels; at most {most:,} are read"
+        )
