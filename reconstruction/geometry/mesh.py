@@ -96,7 +96,7 @@ def read_obj(path: str | Path, most: int | None = None) -> Mesh:
             raise ValueError(f"{path}, line {number}: {error}") from error
         if most is not None and max(len(faces), len(vertices)) > most:
             raise ValueError(
-                f"{path}: more than {most:,} triangles or vertices; at most {most:,} are read: "
+                f"{path}: more than {most:,} triangles or vertices; at most so many are read: "
                 "make the mesh coarser"
             )
     if not faces:

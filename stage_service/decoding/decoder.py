@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import socket
@@ -20,9 +21,11 @@ from numpy.typing import NDArray
 from reconstruction import Light, Mesh
 from reconstruction.arrays import Array, Bools
 from reconstruction.reading import printable
+from stage_service.background import beside
 from stage_service.decoding import framing
 from stage_service.decoding.limits import FRAMES, GIVEN, Limits
 
+log = logging.getLogger("hairstage.decoding")
 START_S = 60.0
 """Until the process has loaded its libraries, on a busy machine."""
 GRACE_S = 10.0
@@ -99,6 +102,17 @@ class Decoder:
         """Start the process now, so that the first file waits for nothing."""
         with self._lock:
             self._running()
+
+    def warm_up(self) -> None:
+        """Start the process beside all else."""
+
+        def start() -> None:
+            try:
+                self.start()
+            except (DecoderBusy, OSError) as error:  # whoever needs it tries again, and is told
+                log.warning("no decoder could be started: %s", error)
+
+        beside(start, "decoder")
 
     def close(self) -> None:
         """End the process, whatever it is at."""
@@ -186,7 +200,8 @@ class Decoder:
             deadline = time.monotonic() + limits.wall_s + GRACE_S
             connection.settimeout(limits.wall_s + GRACE_S)
             try:
-                framing.send(connection, request, [] if path else [source])  # type: ignore[list-item]
+                with suppress(ConnectionError):  # it has ended, and says so below
+                    framing.send(connection, request, [source] if isinstance(source, bytes) else [])
                 head, parts = framing.receive(connection, limits.answer, deadline)
                 right = count is None or len(parts) == count
             except TimeoutError:

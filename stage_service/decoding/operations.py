@@ -55,6 +55,7 @@ def figures(file: Path) -> Answer:
 
 def head(file: Path) -> Answer:
     """The triangles of an OBJ: vertices, faces, and which of them are scalp, where it says so."""
+    _check_obj(file, MOST_TRIANGLES)
     mesh = read_obj(file, MOST_TRIANGLES)
     arrays = [mesh.vertices, mesh.faces]
     return _arrays(*arrays, *([] if mesh.scalp is None else [mesh.scalp]))
@@ -70,14 +71,15 @@ def map_weights(
 ) -> Answer:
     """What each light is multiplied by to stand for an environment map of the `kind` "hdr" or
     "exr"; lights are at `positions (L, 3)` and send `intensities (L, 3)` to the origin."""
-    from appearance.model.light_sums import weights_of_environment
-    from appearance.render.environment_maps import load_environment
-    from reconstruction import Light
-
     if kind == "exr":
         _check_exr(file, MOST_MAP_PIXELS)
     else:
         _check_radiance(file, MOST_MAP_PIXELS)
+
+    from appearance.model.light_sums import weights_of_environment
+    from appearance.render.environment_maps import load_environment
+    from reconstruction import Light
+
     lights = [
         Light(f"light {i}", np.array(p), np.array(power))
         for i, (p, power) in enumerate(zip(positions, intensities, strict=True))
@@ -113,7 +115,7 @@ def _check_exr(file: Path, most: int) -> None:
     except Exception as error:  # the binding raises what it likes
         raise ValueError(f"{file}: cannot be read as OpenEXR ({error})") from error
     for width, height, channels in sizes:
-        check_size(file, width, height, most)
+        _check_size(file, width, height, most)
         if channels > MOST_CHANNELS:
             raise ValueError(f"{file}: {channels} channels; at most {MOST_CHANNELS} are read")
     if len(sizes) > 1:
@@ -133,10 +135,23 @@ def _check_radiance(file: Path, most: int) -> None:
     if found is None:
         raise ValueError(f"{file}: cannot be read as a Radiance .hdr image: it has no size")
     first, second = (int(n) for n in found.groups())
-    check_size(file, second, first, most)
+    _check_size(file, second, first, most)
 
 
-def check_size(file: Path, width: int, height: int, most: int) -> None:
+def _check_obj(file: Path, most: int) -> None:
+    """Raise `ValueError` where an OBJ file has more than `most` faces."""
+    faces, last = 0, b"\n"
+    with plain_file(file).open("rb") as opened:
+        while chunk := opened.read(1 << 20):
+            faces += (last + chunk).count(b"\nf")
+            last = chunk[-1:]
+    if faces > most:
+        raise ValueError(
+            f"{file}: {faces:,} faces; at most {most:,} are read: make the mesh coarser"
+        )
+
+
+def _check_size(file: Path, width: int, height: int, most: int) -> None:
     """Raise `ValueError` for more than `most` pixels."""
     if width < 1 or height < 1 or width * height > most:
         raise ValueError(

@@ -30,8 +30,10 @@ MOST_REQUEST = 64 << 20
 REQUEST_S = 60
 """Until the request is read: afterwards its own limits hold."""
 NO_NEW_PRIVILEGES, SIGNAL_AT_PARENTS_DEATH = 38, 1  # linux/prctl.h
-NO_MEMORY = re.compile("bad_alloc|[Uu]nable to allocate|[Ff]ailed to allocate|Insufficient memory")
-"""What libraries make of it, and readers of that."""
+NO_MEMORY = re.compile(
+    "bad_alloc|[Uu]nable to allocate|[Ff]ailed to allocate|Insufficient memory|file has 0 parts"
+)
+"""What libraries make of it, and readers of that; the last is OpenEXR's, of a file that had one."""
 MEMORY_FILE, MOST_ERROR = re.compile(r"/proc/self/fd/\d+"), 1000
 ENDED_BY = {signal.SIGXCPU: "processor", signal.SIGKILL: "memory", signal.SIGALRM: "clock"}
 """Which limit it was, by the signal that ended a fork: SIGKILL where the machine has no memory."""
@@ -68,6 +70,7 @@ def main(control: socket.socket) -> None:
                     _begin(socket.socket(fileno=fd), control, children)
     for pid in children:
         os.kill(pid, signal.SIGKILL)
+    os._exit(0)  # at once: whoever closes it waits
 
 
 def _begin(connection: socket.socket, control: socket.socket, children: dict[int, Any]) -> None:

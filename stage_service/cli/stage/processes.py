@@ -135,6 +135,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
         text = f"serving {service.rig_file.rig.name} at {url} (API: {url}/docs)"
         output.result({"url": url, "root": str(args.root), "rig": str(args.rig)}, text)
 
+    service.decoder.warm_up()
     serve(service, endpoint, access, ready)
 
 
