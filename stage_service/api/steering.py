@@ -36,7 +36,9 @@ async def caller(
     ] = None,
 ) -> Caller:
     """Who asks; raises `Forbidden` where their token lacks a scope that the route needs."""
-    identity, asked = request.state.identity, request.app.state.service.moment()
+    identity = request.state.identity
+    service: Service | None = getattr(request.app.state, "service", None)  # 'view' has none
+    asked = None if service is None else service.moment()
     by = Caller(address_of(request), lease, identity.name, identity.scopes, asked)
     for scope in SCOPES:
         if scope in needed.scopes:

@@ -74,6 +74,7 @@ def main(control: socket.socket) -> None:
 
 
 def _begin(connection: socket.socket, control: socket.socket, children: dict[int, Any]) -> None:
+    parent = os.getpid()
     try:
         pid = os.fork()
     except OSError as error:  # no process, no memory
@@ -88,6 +89,8 @@ def _begin(connection: socket.socket, control: socket.socket, children: dict[int
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         _prctl(SIGNAL_AT_PARENTS_DEATH, signal.SIGKILL)
+        if os.getppid() != parent:  # it has died already
+            return
         control.close()
         for other in children.values():
             other.close()
