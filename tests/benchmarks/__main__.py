@@ -69,8 +69,7 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
     """Run one benchmark, or all; of all, those go without that lack their data."""
     args.out.mkdir(parents=True, exist_ok=True)
     results = {}
-    if args.publish:
-        check_tree(args.quick)
+    commit = check_tree(args.quick) if args.publish else ""
     for name, benchmark in _benchmarks(args.name).items():
         try:
             begun = time.monotonic()
@@ -78,7 +77,7 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
                 results[name] = benchmark.run(args, progress)
             if args.publish:
                 took = time.monotonic() - begun
-                page = publish(name, results[name], args.arguments, args.out, took)
+                page = publish(name, results[name], args.arguments, args.out, took, commit)
                 output.note(f"published {page}")
         except LeftOut as error:
             if args.name != "all":

@@ -41,16 +41,22 @@ class NotPublished(CommandError):
         super().__init__(f"--publish: {reason}", FAILED)
 
 
-def check_tree(quick: bool) -> None:
-    """Raises `NotPublished` for a run whose figures no commit could give again."""
+def check_tree(quick: bool) -> str:
+    """The commit that a run begins at; `NotPublished` if its figures could not be made again."""
     if quick:
         raise NotPublished("--quick gives no figures: publish without it")
     if changed := _git("status", "--porcelain", "--untracked-files=no"):
         raise NotPublished(f"commit these changes first, so that the page names them:\n{changed}")
+    return _git("rev-parse", "--short=12", "HEAD")
 
 
 def publish(
-    name: str, results: Mapping[str, Any], arguments: Sequence[str], out: Path, seconds: float
+    name: str,
+    results: Mapping[str, Any],
+    arguments: Sequence[str],
+    out: Path,
+    seconds: float,
+    commit: str,
 ) -> Path:
     """Write `NAME.json` and `NAME.md` of a run that ended now; returns the page.
 
@@ -64,7 +70,7 @@ def publish(
         "benchmark": name,
         "run": {
             "command": shlex.join(["hairstage", "bench", name, *shown]),
-            "commit": _git("rev-parse", "--short=12", "HEAD"),
+            "commit": commit,
             "date": datetime.now(UTC).date().isoformat(),
             "machine": machine(),
             "seeds": results.get("seeds", results.get("seed", "the command's")),

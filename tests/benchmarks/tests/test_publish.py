@@ -24,10 +24,11 @@ RESULTS = {
 
 
 def test_results_without_a_table_become_one(pages, tmp_path) -> None:
-    page = publish.publish("moving", RESULTS, ["--seeds", "2", "--publish"], tmp_path, 12.4)
+    page = publish.publish("moving", RESULTS, ["--seeds", "2", "--publish"], tmp_path, 12.4, "abc")
     text = page.read_text()
     assert text.startswith(publish.MARK)
     assert "- command: `hairstage bench moving --seeds 2`\n" in text
+    assert "- commit: `abc`\n" in text
     assert "- seconds: 12 s\n" in text
     assert "|  | psnr | kept |\n| --- | --- | --- |\n| straight | 27.04 | True |\n" in text
     kept = json.loads((pages / "moving.json").read_text())
@@ -37,7 +38,7 @@ def test_results_without_a_table_become_one(pages, tmp_path) -> None:
 
 def test_the_table_that_a_benchmark_wrote_is_the_pages(pages, tmp_path) -> None:
     (tmp_path / "bsdf.md").write_text("| a |\n| --- |\n| 1 |\n")
-    text = publish.publish("bsdf", RESULTS, [], tmp_path, 1.0).read_text()
+    text = publish.publish("bsdf", RESULTS, [], tmp_path, 1.0, "abc").read_text()
     assert "| a |" in text
     assert "psnr" not in text
 
