@@ -28,6 +28,7 @@ from stage_service.inputs import BadInput, check_kept, check_new, read_head, rea
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue, NoSuchJob
 from stage_service.leasing import Leasing
+from stage_service.links import check_link
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.plan.resolved import resolve
@@ -48,8 +49,9 @@ from stage_service.service_models import (
     SnapshotRequest,
     StepView,
 )
-from stage_service.storage import NotThere, Removed, Storage
+from stage_service.storage import NotThere, Storage
 from stage_service.submitting import NotFinished, Submitting
+from stage_service.trash import Removed
 from stage_service.verification import Verification, Verifier
 from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
@@ -348,20 +350,24 @@ class Service:
         return self._verifier.get(capture_id)
 
     def capture_path(self, capture_id: str) -> Path:
-        """The capture's folder; one that was put there by hand or by `import` counts too."""
+        """The capture's folder; one that was put there by hand or by `import` counts too. Raises
+        `UnknownCapture`, `LeadsOutside` for a link."""
         try:
-            return self._captures.path(capture_id)
+            path = self._captures.path(capture_id)
         except UnknownCapture:
             if not is_file_name(capture_id):
                 raise
-            path = inside(self.root / "captures", capture_id)
-            if not (path / "plan.json").is_file():
+            path = self.root / "captures" / capture_id
+            check_link(f"the capture {capture_id}", path)
+            if not (inside(self.root / "captures", capture_id) / "plan.json").is_file():
                 raise
             return path.resolve()
+        check_link(f"the capture {capture_id}", path)
+        return path
 
     def _viewed(self, name: str) -> Viewed:
         """A model for the viewer, with the capture of its name or of the job that made it."""
-        model = self.storage.model(name)
+        model = self.storage.whole_model(name)
         with suppress(UnknownCapture, CaptureError):
             return Viewed(model, Capture(self.capture_path(name)))
         with suppress(NoSuchJob, CaptureError):

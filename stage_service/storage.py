@@ -7,32 +7,29 @@ Nothing is removed that is being shot, written or used by a job. What is removed
 from __future__ import annotations
 
 import fcntl
-import logging
-import secrets
-import shutil
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
-from reconstruction import Model, Rig
+from reconstruction import CaptureError, Model, Rig
 from reconstruction.capture.writer import JournalInUse, utc_now
 from reconstruction.containment import inside, is_file_name
-from reconstruction.files.durable import flush, require_free, write_json, write_whole
-from reconstruction.reading import read_json
+from reconstruction.files.durable import require_free, write_whole
+from reconstruction.reading import printable
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import CaptureManager
 from stage_service.decoding import Decoder, Undecodable
 from stage_service.jobs.queue import JobQueue
 from stage_service.jobs.records import Job
+from stage_service.links import check_link, check_links, outward, remove, target_of
+from stage_service.trash import Kind, Removed, Trash
 
-log = logging.getLogger("hairstage.storage")
-Kind = Literal["capture", "model"]
 KEPT_DAYS = 30.0
 """How long what was removed is kept, where nobody asks for less."""
 PAGE_OF_JOBS = 1000
@@ -50,27 +47,24 @@ class BadUpload(ValueError):
     """What was sent is not what its place says."""
 
 
-class Removed(BaseModel):
-    """Something in the trash, or (`name` is None) what would go there: "capture" or "model" `id`,
-    by whom and when (UTC), its bytes, and the models that were made of a capture and stay."""
+class NotRemoved(RuntimeError):
+    """Some of what was to be deleted is still in the trash: `problems` names each, and why."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str | None
-    kind: Kind
-    id: str
-    by: str
-    removed: str
-    bytes: int
-    models: list[str] = []
+    def __init__(self, deleted: int, problems: list[str]) -> None:
+        told = f"{deleted} entries of the trash were deleted, {len(problems)} could not be"
+        super().__init__(f"{told}: {problems[0]}")
+        self.problems = problems
 
 
 class Folder(BaseModel):
-    """A folder by its name: its files, and their bytes."""
+    """A folder by its name: its files, and their bytes. `link` is where it leads, if it is a link,
+    of which nothing is read; `outside` its links that lead out of it, which are not read either."""
 
     name: str
     files: list[str]
     bytes: int
+    link: str | None = None
+    outside: list[str] = []
 
 
 class Storage:
@@ -90,22 +84,31 @@ class Storage:
     ) -> None:
         self._root, self._captures, self._control, self._jobs = root, captures, control, jobs
         self._decoder = decoder
-        self._trash, self._uploads = root / "trash", root / "uploads"
+        self._trash, self._uploads = Trash(root / "trash"), root / "uploads"
         self._uploading = threading.Lock()  # a file has one temporary name
         self._emptying = threading.Lock()  # what is being deleted must not be restored
 
     def models(self) -> list[Folder]:
         """The models, by name."""
-        folder = self._root / "models"
-        found = sorted(folder.iterdir()) if folder.is_dir() else []
-        return [_listed(p) for p in found if p.is_dir() and is_file_name(p.name)]
+        return _folders(self._root / "models")
 
     def model(self, name: str) -> Model:
-        """The model of that name. Raises `NotThere`."""
-        path = self._root / "models" / name
-        if not is_file_name(name) or not path.is_dir():
-            raise NotThere(f"there is no model {name!r}")
+        """The model of that name. Raises `NotThere`, `LeadsOutside` for a link."""
+        path = self._model_place(name)
+        check_link(f"the model {name}", path)
         return Model(path)
+
+    def whole_model(self, name: str) -> Model:
+        """The same, where no link in it leads out of it either."""
+        model = self.model(name)
+        check_links(f"the model {name}", model.path)
+        return model
+
+    def _model_place(self, name: str) -> Path:
+        path = self._root / "models" / name
+        if not is_file_name(name) or not (path.is_dir() or path.is_symlink()):
+            raise NotThere(f"there is no model {name!r}")
+        return path
 
     def remove_capture(
         self, capture: str, owed: Callable[[str], bool], by: Caller, *, dry_run: bool
@@ -116,7 +119,8 @@ class Storage:
         status = self._captures.get(capture)
         by.require("admin" if status.outcome == "completed" else "steer")
         path = Path(status.path)
-        made = [j for j in self._all_jobs() if Path(j.capture) == path.resolve()]
+        whole = path if path.is_symlink() else path.resolve()  # a link's jobs are another's
+        made = [j for j in self._all_jobs() if Path(j.capture) == whole]
         busy = next((j.id for j in made if j.state != "done"), None)
         if busy is not None or owed(capture):
             raise InUse(f"capture {capture}: job {busy or 'to follow'} needs it: wait, or cancel")
@@ -129,7 +133,7 @@ class Storage:
 
         def move(folder: Path) -> Removed:
             with _no_writer(folder):
-                return self._into_trash(found, folder)
+                return self._trash.put(found, folder)
 
         work = partial(self._captures.set_aside, capture, move)
         removed = self._control.do(by, "capture.remove", work, capture)
@@ -140,50 +144,40 @@ class Storage:
         """Put a model into the trash. Raises `NotThere`, `InUse`, `Forbidden`,
         `JobsUnavailable`."""
         by.require("admin")
-        model = self.model(name)
+        model = Model(self._model_place(name))
         busy = self._jobs.at_work_on(model)
         if busy is not None:
             raise InUse(f"model {name}: job {busy} makes it: wait, or cancel it")
         found = self._removal("model", name, model.path, by)
         if dry_run:
             return found
-        work = partial(self._into_trash, found, model.path)
+        work = partial(self._trash.put, found, model.path)
         removed = self._control.do(by, "model.remove", work, name, steers=False)
         self._tell("removed", removed)
         return removed
 
     def trash(self) -> list[Removed]:
         """What was removed, oldest first."""
-        found = []
-        for path in sorted(self._trash.glob("*/removed.json")):
-            try:
-                removed = Removed.model_validate(read_json(path))
-            except (OSError, ValueError) as error:
-                log.warning("%s cannot be read: %s", path, error)
-                continue
-            if (path.parent / removed.id).exists() and is_file_name(removed.id):
-                found.append(removed.model_copy(update={"name": path.parent.name}))
-        return sorted(found, key=lambda r: r.removed)
+        return [found for _, found in self._trash.entries()]
 
     def restore(self, name: str, by: Caller) -> Removed:
         """Put something back. Raises `NotThere`, `InUse` where its place is taken, `Forbidden`."""
         by.require("admin")
         with self._emptying:
-            found = next((r for r in self.trash() if r.name == name), None)
-            if found is None:
+            entries = self._trash.entries()
+            place, found = next((e for e in entries if e[1].name == name), (None, None))
+            if place is None or found is None:
                 raise NotThere(f"the trash has no {name!r}")
-            return self._restore(found, by)
+            if found.problem is not None:
+                raise NotThere(f"{name} cannot be restored: {found.problem}")
+            return self._restore(place, found, by)
 
-    def _restore(self, found: Removed, by: Caller) -> Removed:
-        place = self._trash / str(found.name)
-
+    def _restore(self, place: Path, found: Removed, by: Caller) -> Removed:
         def work() -> Removed:
             to = self._root / f"{found.kind}s" / found.id
-            if to.exists():
+            if os.path.lexists(to):
                 raise InUse(f"{found.kind} {found.id} is there again: remove that one first")
-            (place / found.id).rename(to)
-            flush(to.parent)
-            shutil.rmtree(place)
+            self._trash.take_out(place, found, to)
             if found.kind == "capture":
                 self._captures.catalogue.adopt(found.id)
             return found
@@ -193,28 +187,32 @@ class Storage:
         return restored
 
     def empty(self, older_than_days: float, by: Caller, *, dry_run: bool) -> list[Removed]:
-        """Delete for good what was removed so many days ago; returns what was. `Forbidden`."""
+        """Delete for good what was removed so many days ago; returns what was. Raises `Forbidden`,
+        and `NotRemoved` where some of it cannot be deleted, after all else was."""
         by.require("admin")
         before = (datetime.now(UTC) - timedelta(days=older_than_days)).isoformat()
         with self._emptying:
-            old = [r for r in self.trash() if r.removed <= before]
-            for found in [] if dry_run else old:
-                work = partial(self._delete, found)
-                detail = f"{found.bytes:,} bytes"
-                self._control.do(
-                    by, f"{found.kind}.delete", work, found.id, detail=detail, steers=False
-                )
-        return old
-
-    def _delete(self, found: Removed) -> None:
-        place = self._trash / str(found.name)
-        shutil.rmtree(place / found.id)  # first: what is left of it stays listed until all has gone
-        shutil.rmtree(place)
+            old = [e for e in self._trash.entries() if e[1].removed <= before]
+            if dry_run:
+                return [found for _, found in old]
+            deleted, problems = [], []
+            for place, found in old:
+                kind = "trash" if found.kind == "unknown" else found.kind
+                work, detail = partial(self._trash.delete, place, found), f"{found.bytes:,} bytes"
+                try:
+                    self._control.do(
+                        by, f"{kind}.delete", work, found.id, detail=detail, steers=False
+                    )
+                    deleted.append(found)
+                except OSError as error:
+                    problems.append(f"{found.name} ({found.kind} {found.id}): {error}")
+        if problems:
+            raise NotRemoved(len(deleted), [printable(p) for p in problems])
+        return deleted
 
     def uploads(self) -> list[Folder]:
         """What was uploaded, by subject."""
-        found = sorted(self._uploads.iterdir()) if self._uploads.is_dir() else []
-        return [_listed(p) for p in found if p.is_dir() and is_file_name(p.name)]
+        return _folders(self._uploads)
 
     def upload_head(self, subject: str, data: bytes, by: Caller) -> Folder:
         """Keep a digitised head (OBJ). Raises `BadUpload`, `DecoderBusy`, `DiskFull`."""
@@ -238,26 +236,32 @@ class Storage:
         return self._upload(subject, name, data, by)
 
     def uploaded(self, subject: str) -> tuple[Path | None, Path | None]:
-        """Head and folder of masks of a subject, where there are any. Raises `NotThere`."""
-        folder = self._uploads / subject
-        if not is_file_name(subject) or not folder.is_dir():
-            raise NotThere(f"no subject was uploaded as {subject!r}")
+        """Head and folder of masks of a subject, where there are any. Raises `NotThere`,
+        `LeadsOutside`."""
+        folder = self._upload_place(subject)
+        check_links(f"the upload {subject}", folder)
         head, masks = folder / "head.obj", folder / "masks"
         return head if head.is_file() else None, masks if masks.is_dir() else None
 
     def remove_upload(self, subject: str, by: Caller) -> Folder:
         """Delete what was uploaded; captures have copies of their own. Raises `NotThere`."""
         with self._uploading:
-            self.uploaded(subject)
-            found = _listed(self._uploads / subject)
-            work = partial(shutil.rmtree, self._uploads / subject)
+            folder = self._upload_place(subject)
+            found, work = _listed(folder), partial(remove, folder)
             self._control.do(by, "upload.delete", work, subject, steers=False)
         return found
+
+    def _upload_place(self, subject: str) -> Path:
+        folder = self._uploads / subject
+        if not is_file_name(subject) or not (folder.is_dir() or folder.is_symlink()):
+            raise NotThere(f"no subject was uploaded as {subject!r}")
+        return folder
 
     def _upload(self, subject: str, name: str, data: bytes, by: Caller) -> Folder:
         folder = self._uploads / subject
 
         def work() -> Folder:
+            check_link(f"the upload {subject}", folder)
             require_free(self._root, len(data))
             path = inside(folder, name)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -269,22 +273,16 @@ class Storage:
             return self._control.do(by, "upload", work, subject, detail=detail, steers=False)
 
     def _removal(self, kind: Kind, name: str, path: Path, by: Caller) -> Removed:
-        size = _listed(path).bytes
-        return Removed(name=None, kind=kind, id=name, by=str(by), removed=utc_now(), bytes=size)
-
-    def _into_trash(self, found: Removed, folder: Path) -> Removed:
-        name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
-        place = self._trash / name
-        place.mkdir(parents=True)
-        try:
-            write_json(place / "removed.json", found.model_dump(mode="json"))
-            folder.rename(place / found.id)
-        except BaseException:
-            shutil.rmtree(place)
-            raise
-        flush(place)
-        flush(folder.parent)
-        return found.model_copy(update={"name": name})
+        listed = _listed(path)
+        return Removed(
+            name=None,
+            kind=kind,
+            id=name,
+            by=str(by),
+            removed=utc_now(),
+            bytes=listed.bytes,
+            link=listed.link,
+        )
 
     def _tell(self, what: str, found: Removed) -> None:
         self._captures.events.publish(f"{found.kind}.{what}", {"id": found.id})
@@ -299,6 +297,9 @@ class Storage:
 @contextmanager
 def _no_writer(capture: Path) -> Iterator[None]:
     """Hold the journal's lock, where there is a journal. Raises `JournalInUse`."""
+    if capture.is_symlink():  # its journal is another's
+        yield
+        return
     try:
         journal = inside(capture, "journal.jsonl").open("rb")
     except (OSError, ValueError):  # a damaged capture may lack it
@@ -312,11 +313,26 @@ def _no_writer(capture: Path) -> Iterator[None]:
         yield
 
 
-def files_of(folder: Path) -> dict[str, Path]:
-    """The whole files that lie under a folder, by their relative names, in order."""
+def files_of(what: str, folder: Path) -> dict[str, Path]:
+    """The whole files that lie under a folder, called `what`, by their relative names, in order.
+    Raises `CaptureError` where it has gone, `LeadsOutside` where some of it lies elsewhere."""
+    check_links(what, folder)
+    if not folder.is_dir():
+        raise CaptureError(
+            f"{folder}: {what} is not there any more: its folder was moved or removed"
+        )
     return Model(folder).artifacts()
 
 
+def _folders(folder: Path) -> list[Folder]:
+    """The folders in one, and the links, wherever they lead, by name."""
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [_listed(p) for p in found if (p.is_dir() or p.is_symlink()) and is_file_name(p.name)]
+
+
 def _listed(folder: Path) -> Folder:
-    sizes = Model(folder).sizes()
-    return Folder(name=folder.name, files=list(sizes)[:1000], bytes=sum(sizes.values()))
+    if (link := target_of(folder)) is not None:
+        return Folder(name=folder.name, files=[], bytes=0, link=link)
+    sizes, outside = Model(folder).sizes(), outward(folder)
+    files, total = list(sizes)[:1000], sum(sizes.values())
+    return Folder(name=folder.name, files=files, bytes=total, outside=outside)

@@ -16,6 +16,7 @@ from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job
+from stage_service.links import check_link, check_links
 from stage_service.service_models import Artifact, JobRequest
 
 
@@ -103,6 +104,7 @@ class Submitting:
             )
         check_named(request.pipeline, capture.rig)
         model = Model(self._models / (request.model or job))
+        check_links(f"the model {model.path.name}", model.path)
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
         if not rebuilds and not model.has("strands.npz"):
             raise BadInput(
@@ -138,13 +140,19 @@ class Submitting:
         return self._control.do(by, "job.cancel", work, job_id, steers=False)
 
     def artifacts(self, job_id: str) -> list[Artifact]:
-        """The files in the job's model folder. Raises `NoSuchJob`."""
-        sizes = Model(self.get(job_id).model).sizes()
+        """The files in the job's model folder. Raises `NoSuchJob`, `LeadsOutside`."""
+        sizes = self._model_of(job_id).sizes()
         return [Artifact(path=name, bytes=size) for name, size in sizes.items()]
 
     def artifact(self, job_id: str, path: str) -> Path:
-        """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`."""
-        file = Model(self.get(job_id).model).artifacts().get(path)
+        """A file of the job's model folder. Raises `NoSuchJob`, `UnknownArtifact`,
+        `LeadsOutside`."""
+        file = self._model_of(job_id).artifacts().get(path)
         if file is None:
             raise UnknownArtifact(f"job {job_id} has no file {path!r}")
         return file
+
+    def _model_of(self, job_id: str) -> Model:
+        model = Model(self.get(job_id).model)
+        check_link(f"the model {model.path.name}", model.path)
+        return model

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from reconstruction import Capture, CaptureError
 from reconstruction.options import sentence
 from reconstruction.reading import printable
+from stage_service.links import check_link
 
 State = Literal["idle", "running", "pausing", "paused", "aborting", "finishing", "done"]
 Outcome = Literal["completed", "aborted", "failed", "interrupted", "damaged"]
@@ -162,6 +163,7 @@ def read_status(path: Path) -> CaptureStatus:
 
 
 def _read_status(path: Path) -> CaptureStatus:
+    check_link(f"the capture {path.name}", path)
     capture = Capture(path)
     if capture.manifest is not None and "outcome" not in capture.manifest:
         raise CaptureError(f"{path / 'manifest.json'}: the field 'outcome' is missing")

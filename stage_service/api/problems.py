@@ -37,13 +37,14 @@ from stage_service.devices.permission import NotPermitted
 from stage_service.frames import UnknownFrame
 from stage_service.inputs import BadInput
 from stage_service.jobs.queue import JobsUnavailable, NoSuchJob
+from stage_service.links import LeadsOutside
 from stage_service.plan.flash import FlashRefusal
 from stage_service.plan.resolved import PlanError
 from stage_service.records.attempts import TooManyLogins
 from stage_service.records.audit import NotRecorded
 from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
-from stage_service.storage import BadUpload, InUse, NotThere
+from stage_service.storage import BadUpload, InUse, NotRemoved, NotThere
 from stage_service.submitting import KeyUsed, ModelInUse, NotFinished, UnknownArtifact
 from stage_service.viewer import BadLight, NothingToView
 from stage_service.watching import NotReady
@@ -115,6 +116,12 @@ queue-full 409 The queue has no room
 in-use 409 A job still needs it
     `detail` names the job, or the file that one has just put away. Wait until it is done, or
     cancel it.
+not-removed 409 Some of the trash could not be deleted
+    All else was. `problems` names each entry that is left and the disk's error; put that right and
+    empty the trash again.
+leads-outside 409 A link leads out of the store
+    `detail` names the link and where it leads: nothing is read through it. Put the folder or file
+    itself there, or remove the link with DELETE, which leaves alone what it leads to.
 not-there 404 No such thing in the store
     `GET /models`, `/uploads` and `/trash` list what there is.
 disk-full 507 The disk has no room
@@ -185,6 +192,8 @@ BY_ERROR: dict[type[Exception], str] = {
     Undecodable: "bad-input",
     DecoderBusy: "decoder-busy",
     InUse: "in-use",
+    NotRemoved: "not-removed",
+    LeadsOutside: "leads-outside",
     NotThere: "not-there",
     NothingToView: "not-there",
     ModelError: "not-there",

@@ -12,7 +12,8 @@ from stage_service.api.downloads import RANGES, tar_response
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Administrates, OnService, Processes, Steers
 from stage_service.service_models import FILE_NAME
-from stage_service.storage import KEPT_DAYS, Folder, Removed, files_of
+from stage_service.storage import KEPT_DAYS, Folder, files_of
+from stage_service.trash import Removed
 from stage_service.verification import Verification
 
 router = APIRouter(tags=["storage"])
@@ -39,7 +40,7 @@ async def remove_capture(
 @reading.get("/captures/{capture}/archive.tar", response_class=Response, responses=TAR)
 def get_capture_archive(capture: str, service: OnService) -> Response:
     """All files of a capture that is done, as a tar file; goes on by ranges where it broke off."""
-    return tar_response(capture, files_of(service.done_capture(capture)))
+    return tar_response(capture, files_of(f"the capture {capture}", service.done_capture(capture)))
 
 
 @router.post("/captures/{capture}/verify", status_code=status.HTTP_202_ACCEPTED)
@@ -71,7 +72,7 @@ async def remove_model(
 @reading.get("/models/{model}/archive.tar", response_class=Response, responses=TAR)
 def get_model_archive(model: str, service: OnService) -> Response:
     """All whole files of a model as a tar file."""
-    return tar_response(model, files_of(service.storage.model(model).path))
+    return tar_response(model, files_of(f"the model {model}", service.storage.model(model).path))
 
 
 @reading.get("/trash")

@@ -141,7 +141,8 @@ class Catalogue:
         with self._reading:
             if folder.name not in unread:
                 return
-            status = self._index.status(folder) if any(_there(folder / f) for f in FILES) else None
+            known = folder.is_symlink() or any(_there(folder / f) for f in FILES)
+            status = self._index.status(folder) if known else None
             with self._lock:
                 del unread[folder.name]
                 if status is None:  # it is no capture

@@ -29,6 +29,8 @@ class StatusIndex:
 
     def status(self, folder: Path) -> CaptureStatus:
         """A folder's status, as `read_status` has it; read again only where it has changed."""
+        if folder.is_symlink():  # the files that would stamp it are not looked at
+            return read_status(folder)
         if self._known is None:
             self._known = _known(self._file)
         stamp = [_stamp(folder / name) for name in FILES]

@@ -111,6 +111,8 @@ def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient)
 def _list(found: list[dict[str, Any]], output: Output, nothing: str) -> None:
     lines = [
         f"{r['name']}  {r['kind']} {r['id']}  {r['bytes']:,} bytes  {r['removed']}  by {r['by']}"
+        + (f"  a link to {r['link']}" if r["link"] else "")
+        + (f"  cannot be restored: {r['problem']}" if r["problem"] else "")
         for r in found
     ]
     output.result({"trash": found}, "\n".join(lines) or nothing)

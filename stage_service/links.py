@@ -1,0 +1,75 @@
+"""Links in the store: listed with where they lead, removed as links, and nothing is read through
+one that leads out of its folder.
+
+`captures/`, `models/`, `uploads/` and the root may themselves be links, to a larger disk.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from reconstruction.reading import printable
+
+MOST_NAMED = 20
+"""Links that a list names: the first is enough to find the others."""
+
+
+class LeadsOutside(ValueError):
+    """A capture, model or upload is a link, or has links that lead out of it; says which."""
+
+
+def target_of(path: Path) -> str | None:
+    """Where a link leads, as it is written in it; None for what is no link."""
+    return printable(str(path.readlink())) if path.is_symlink() else None
+
+
+def outward(folder: Path) -> list[str]:
+    """The links below `folder` that lead out of it, or nowhere: "name -> where"; the first of them.
+
+    Folders that are links are not entered.
+    """
+    root, found = folder.resolve(), []
+    for place, folders, files in os.walk(folder):
+        for name in sorted([*folders, *files]):
+            path = Path(place) / name
+            if path.is_symlink() and not _inside(path, root):
+                found.append(f"{printable(str(path.relative_to(folder)))} -> {target_of(path)}")
+                if len(found) == MOST_NAMED:
+                    return found
+    return found
+
+
+def check_link(what: str, path: Path) -> None:
+    """Raise `LeadsOutside` where `path`, called `what`, is a link."""
+    if (target := target_of(path)) is not None:
+        raise LeadsOutside(
+            f"{what} is a link to {target}, which is not read: put the folder itself here, or "
+            "remove the link (DELETE)"
+        )
+
+
+def check_links(what: str, path: Path) -> None:
+    """The same, also where a link below it leads out of it."""
+    check_link(what, path)
+    if found := outward(path):
+        raise LeadsOutside(
+            f"{what} has links that lead out of it, which are not read: {', '.join(found[:3])}: "
+            "put the files themselves here"
+        )
+
+
+def remove(path: Path) -> None:
+    """Remove a link itself, never what it leads to; else a file, or a folder with all in it."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink()
+    else:
+        shutil.rmtree(path)
+
+
+def _inside(path: Path, root: Path) -> bool:
+    try:
+        return path.resolve(strict=True).is_relative_to(root)
+    except (OSError, RuntimeError):  # it leads nowhere, or round and round
+        return False
