@@ -49,6 +49,7 @@ from stage_service.service_models import (
     SnapshotRequest,
     StepView,
 )
+from stage_service.stopping import Step, end_all
 from stage_service.storage import NotThere, Storage
 from stage_service.submitting import NotFinished, Submitting
 from stage_service.trash import Removed
@@ -57,8 +58,13 @@ from stage_service.viewer import Viewed, Viewing
 from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
-FLUSH_S = 1.0
+FLUSH_S = 0.5
 """The end of the service waits for so long for the audit log's disk."""
+LIGHTS_S = 6.0
+"""And for so long for a capture's end: until lamps and projectors are read back dark, its folder is
+finished and the stage given up (`STOP_WITHIN_S`, `TIDY_S`, `RELEASE_S`)."""
+OTHERS_S = 3.0
+"""And for all that lights nothing, beside that."""
 READ_S = 1.0
 """A start waits for so long for the captures on the disk; the others are read beside it."""
 
@@ -110,7 +116,8 @@ class Service:
         )
         self.calibrating = Calibrating(root / "calibration", rig_file, self.events, self.decoder)
         self._closing = threading.Lock()
-        self._closed = threading.Event()
+        self._stopping = self._closed = False
+        self.not_ended: list[str] = []  # while it closes, and afterwards
 
     @property
     def events(self) -> EventLog:
@@ -157,22 +164,33 @@ class Service:
         self._has_stage = True
 
     def close(self) -> None:
-        """Abort what runs, lights off; afterwards let go of the job database."""
+        """Lights off and what runs aborted, and beside it everything else ended, each in its time
+        (`LIGHTS_S`, `OTHERS_S`, `FLUSH_S`): what has not ended by then is in `not_ended`."""
+        self._stopping = True
         with self._closing:
-            if self._closed.is_set():
+            if self._closed:
                 return
-            self.queue.close()
-            self._verifier.close()
-            self.calibrating.close()
-            try:
-                self._captures.close()
-            finally:
-                self._closed.set()
-        self.refusals.close()
-        self._control.audit.flush(FLUSH_S)
-        self.decoder.close()
+            end_all(
+                [
+                    Step("lamps and capture", self._captures.close, LIGHTS_S),
+                    Step("the queue", self.queue.close, OTHERS_S),
+                    Step("reading captures again", self._verifier.close, OTHERS_S),
+                    Step("the calibration", self.calibrating.close, OTHERS_S),
+                    Step("the decoder", self.decoder.close, OTHERS_S),
+                    Step("the job database", self._close_jobs, OTHERS_S),
+                ],
+                self.not_ended,
+            )
+            end_all([Step("the audit log", self._close_audit, FLUSH_S)], self.not_ended)
+            self._closed = True
+
+    def _close_jobs(self) -> None:
         self._follower.close()
         self._queue.close()
+
+    def _close_audit(self) -> None:
+        self.refusals.close()
+        self._control.audit.flush(FLUSH_S)
 
     def validate(self, plan: CapturePlan) -> PlanCost:
         """Cost a plan without touching a device. Raises `PlanError`."""
@@ -409,6 +427,8 @@ class Service:
         free_bytes, worker = self.watching.disk()
         lamps, latched = self._captures.safety(), self._captures.stage.latch.latched
         problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
+        if self._stopping:
+            problems.insert(0, "the service is stopping: it lights nothing any more")
         if damaged := self._verifier.damaged:
             problems.append(f"damaged when they were last read again: {', '.join(damaged[:5])}")
         if latched is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
@@ -33,9 +34,15 @@ from stage_service.api.lanes import Lanes
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.records.refusals import Refusals
 from stage_service.service import Service
+from stage_service.stopping import Ending
 from stage_service.viewer import Viewing
 from stage_service.web import pages
 from stage_service.web.headers import SafeHeaders
+
+REQUESTS_S = 1
+"""Requests that are under way once everything else has been closed have so long."""
+THREADS_S = 1.0
+"""And their threads, and the interpreter's own end, so long after that."""
 
 
 def create_app(service: Service, access: Access | None = None) -> FastAPI:
@@ -104,11 +111,14 @@ def _completed(app: FastAPI, access: Access, refusals: Refusals | None = None) -
 
 
 class _Announcing(uvicorn.Server):
-    """Says when requests are answered."""
+    """Says when requests are answered; once it is to stop, they have `REQUESTS_S`, and it ends by
+    `STOP_S` whatever hangs. A second signal leaves them no time."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
         super().__init__(config)
         self._ready = ready
+        self.ending: Ending | None = None
+        self._not_ended: list[str] = []
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -116,17 +126,40 @@ class _Announcing(uvicorn.Server):
             listener.listen(QUEUED)
         self._ready()
 
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        if self.ending is not None:
+            super().handle_exit(sig, frame)
+            return
+        self.ending = ending = Ending(self._not_ended, self._under_way)
+        threading.Thread(target=self._stop, args=(ending, sig), name="stop", daemon=True).start()
+
+    def _stop(self, ending: Ending, sig: int) -> None:
+        try:
+            self._close()
+        finally:
+            # What it says of requests that it cuts off, `Ending` says in a line.
+            logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+            ending.by(REQUESTS_S + THREADS_S)
+            super().handle_exit(sig, None)
+
+    def _close(self) -> None:
+        """Close what is served, while requests are still answered."""
+
+    def _under_way(self) -> str:
+        requests = len(self.server_state.tasks)
+        return f"{requests} requests" if requests else ""
+
 
 class _Server(_Announcing):
-    """Puts the lights off at the signal itself, not after the last connection has closed."""
+    """Puts the lights off at the signal itself, and answers until everything has been closed:
+    blackout and health, above all."""
 
     def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
         super().__init__(config, ready)
-        self._service = service
+        self._service, self._not_ended = service, service.not_ended
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        threading.Thread(target=self._service.close, name="lights-off").start()
-        super().handle_exit(sig, frame)
+    def _close(self) -> None:
+        self._service.close()
 
 
 @dataclass(frozen=True)
@@ -168,7 +201,11 @@ def serve_viewer(
         url = Endpoint().url(listener.getsockname()[1])
         app = create_viewer(models, access)
         config = uvicorn.Config(
-            app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, **limits()
+            app,
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=REQUESTS_S,
+            **limits(),
         )
         _Announcing(config, lambda: ready(url)).run(sockets=[listener])
 
@@ -189,14 +226,17 @@ def serve(
             create_app(service, access),
             log_level="warning",
             access_log=False,
-            timeout_graceful_shutdown=3,
+            timeout_graceful_shutdown=REQUESTS_S,
             ssl_certfile=endpoint.certificate,
             ssl_keyfile=endpoint.key,
             **limits(),
         )
+        server = _Server(config, service, lambda: ready(url))
         try:
-            _Server(config, service, lambda: ready(url)).run(sockets=[listener])
+            server.run(sockets=[listener])
         finally:
             service.close()
             if endpoint.socket is not None:
                 endpoint.socket.unlink(missing_ok=True)
+            if server.ending is not None and server.ending.left:
+                server.ending.now()

@@ -45,8 +45,8 @@ from stage_service.records.logs import about
 
 log = logging.getLogger("hairstage.captures")
 T = TypeVar("T")
-STOP_WITHIN_S = 30.0
-"""A capture that is stopped at once is out of its last device call within this time."""
+STOP_WITHIN_S = 3.0
+"""The end of the service waits for so long until a capture that runs is read back dark."""
 TIDY_S = 1.0
 """How long a blackout, once it is dark, waits for the capture's folder to be finished."""
 GIVEN_UP_S = 5.0
@@ -485,7 +485,7 @@ class CaptureManager:
             self._revoke("the service is closing")
         if run is not None and run.thread is not None:
             result = run.sequencer.darken(STOP_WITHIN_S)
-            run.thread.join(STOP_WITHIN_S)
+            run.thread.join(TIDY_S)
             if run.thread.is_alive():  # it is stuck somewhere
                 self.stage.learn(result)
             else:  # `darken` may have opened links after the run had closed them

@@ -17,7 +17,7 @@ from stage_service.devices.lights.interface import LightBank
 from stage_service.records.lease import FileLock, LockedBy
 
 log = logging.getLogger("hairstage.ownership")
-RELEASE_S = 2.0
+RELEASE_S = 1.0
 """A bank that hangs keeps a service for no longer from ending."""
 
 

@@ -29,6 +29,7 @@ from stage_service.jobs.slots import BEAT_S, WorkerSlot, hold_dead
 from stage_service.jobs.steps import STEPS, StepContext
 from stage_service.records.logs import about
 from stage_service.signals import taken
+from stage_service.stopping import Ending, Step, end_all
 
 log = logging.getLogger("hairstage.worker")
 
@@ -36,6 +37,8 @@ CANCEL_S = 10.0
 """A cancelled step that has not stopped by then, deep in native code, ends with its process."""
 MOST_ATTEMPTS = 20
 """A job whose worker died, or was stopped, this often is given up."""
+DATABASE_S = 3.0
+"""A job database that does not answer keeps a worker that is to stop for no longer."""
 LOOK_S = 5.0
 """How often a worker looks whether another has died on a job."""
 RETRY_S = 5.0
@@ -201,6 +204,9 @@ def run_worker(
         return worker.run_job(spec)
 
     stop = taken(signal.SIGTERM, signal.SIGINT)
+    # From here on: what follows may hang with the database, and must not keep it from ending.
+    ends = threading.Thread(target=_end, args=(worker, stop), name="stop", daemon=True)
+    ends.start()
     queue = names.queue(gpu)
     DBOS.listen_queues([queue])
     DBOS.launch()
@@ -208,12 +214,18 @@ def run_worker(
         threading.Thread(target=work, daemon=True).start()
     DBOS.register_queue(queue, worker_concurrency=concurrency, polling_interval_sec=0.2)
     ready(worker.slot.name)
+    ends.join()
+
+
+def _end(worker: Worker, stop: Callable[[], None]) -> None:
+    """End this process once `stop` returns. Step threads may be deep in native code; they hold
+    nothing that the next worker needs."""
     stop()
+    left: list[str] = []
+    ending = Ending(left)
     worker.stop()
-    DBOS.destroy()
-    # Step threads may be deep in native code; they hold nothing that the next worker needs.
-    logging.shutdown()
-    os._exit(0)
+    end_all([Step("the job database", DBOS.destroy, DATABASE_S)], left)
+    ending.now()
 
 
 def _not_told_twice(record: logging.LogRecord) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, Self
 from stage_service.cli.support.commands import BAD_INPUT, UNREACHABLE, CommandError
 from stage_service.signals import held, tied
 
-GRACE_S = 40.0
+GRACE_S = 20.0
 """How long a child may take to end by itself: the service puts the lights off in that time."""
 
 
