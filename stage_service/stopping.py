@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from stage_service.background import beside
 
@@ -43,7 +44,7 @@ def end_all(steps: Iterable[Step], left: list[str]) -> None:
     for step in steps:
         left.append(step.name)
         over = beside(step.work, step.name)
-        over.add_done_callback(lambda _, name=step.name: left.remove(name))
+        over.add_done_callback(partial(_ended, left, step.name))
         under_way.append((step, over))
     for step, over in under_way:
         try:
@@ -53,6 +54,10 @@ def end_all(steps: Iterable[Step], left: list[str]) -> None:
                 log.exception("%s", step.name, exc_info=error)
             else:
                 log.error("%s: not ended within %g s", step.name, step.within_s)
+
+
+def _ended(left: list[str], name: str, _over: object) -> None:
+    left.remove(name)
 
 
 class Ending:
