@@ -160,3 +160,10 @@ def test_a_wrong_command_would_be_noticed(wrong: str) -> None:
 def test_the_pages_have_commands() -> None:
     assert sum(len(list(blocks(p))) for p in PAGES) >= 10
     assert sum(len(list(mentions(p))) for p in PAGES) >= 15
+
+
+def test_every_test_that_the_page_of_hazards_names_is_there():
+    page = (ROOT / "docs" / "reference" / "hazards.md").read_text()
+    named = set(re.findall(r"`(tests/[^`]+)`", page))
+    assert len(named) > 10
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
