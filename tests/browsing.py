@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 PATIENCE_MS = 20_000
@@ -18,8 +19,15 @@ class Pages:
         self._context = browser.new_context(viewport={"width": 1280, "height": 800})
         self._context.set_default_timeout(PATIENCE_MS)
 
-    def open(self, view: str = "now") -> Any:
+    def open_as(self, token: str, prepare: Callable[[Any], object] = lambda _page: None) -> Any:
+        """A page that is logged in by this token; `prepare(page)` is called before it is loaded."""
+        answer = self._context.request.post(f"{self.url}/login", data={"token": token})
+        assert answer.ok, answer.text()
+        return self.open(prepare=prepare)
+
+    def open(self, view: str = "now", prepare: Callable[[Any], object] = lambda _page: None) -> Any:
         page = self._context.new_page()
+        prepare(page)
         page.on("console", self._hear)
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
         page.on("request", lambda request: self.hosts.add(re.split("[/?#]", request.url)[2]))

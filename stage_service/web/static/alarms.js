@@ -36,7 +36,7 @@ function refusal() {
   if (!why) return null;
   const login = why.kind === "unauthorized";
   return alarm("", login ? "Log in again. The stage was NOT darkened: press the wired emergency stop." : "The stage was NOT darkened: press the wired emergency stop.",
-    `Blackout of ${clock(pressed.at)} was refused${login ? ": this page is not logged in, and its right to send Blackout alone is missing or no longer valid. It is sent again as soon as you log in." : `: ${why.detail}`} `,
+    `Blackout of ${clock(pressed.at)} was refused: ${login ? "this page is not logged in, and has no valid right to send Blackout without a login. It is sent again as soon as you log in." : `${why.detail}.`} ${watchdogSentence()} `,
     button(login ? "do not send it again" : "seen", () => dismiss(), { kind: "quiet" }));
 }
 
@@ -56,7 +56,7 @@ function answer() {
 }
 
 function loggedOut() {
-  if (!S.out) return null;
+  if (!S.out || pressed?.refused) return null;
   if (right()) return alarm(".accepted", S.who ? "Your login has ended." : "You are not logged in.", "Nothing of the stage is shown. Blackout (F9) works without a login.");
   return alarm("", "This page cannot darken the stage.", `Blackout (F9) needs a browser that has logged in here before. Log in, or press the wired emergency stop. ${watchdogSentence()}`);
 }
@@ -70,7 +70,7 @@ function silent() {
 
 function polling() {
   if (!S.polling) return null;
-  return alarm(".accepted", "The service refuses live events to this page.", `It answers: ${S.polling}. The page asks every second instead. Abort and Blackout work.`);
+  return alarm(".accepted", "The service refuses live events to this page.", `Its reason: ${S.polling}. The page requests the state every second instead. Abort and Blackout work.`);
 }
 
 function stage() {
@@ -82,7 +82,8 @@ function stage() {
 
 function failed(latch) {
   const { id, error } = S.failed;
-  return alarm("", `Capture ${id} failed.`, `${latch ? (error ?? "").split("; blackout: ")[0] : error ?? ""} `, button("seen", () => {
+  const why = latch ? (error ?? "").split("; blackout: ")[0] : error ?? "";
+  return alarm("", `Capture ${id} failed.`, `${latch?.detail.includes(why) ? "The reason is above." : why} `, button("seen", () => {
     sessionStorage.setItem("seen", id);
     S.failed = null;
     changed();

@@ -3,7 +3,8 @@
 import { ask, service, tell } from "./ask.js";
 import { local } from "./dom.js";
 
-const PATIENCE_MS = 5000; // the service answers a blackout within 1 s
+const PATIENCE_MS = 5000; // of the first try; the service answers a blackout within 1 s
+const MOST_PATIENCE_MS = 20_000; // a frozen service finds all tries once it goes on: few
 const AGAIN_MS = 500;
 const YIELD_MS = 1200; // a service that answers has done so by then
 const LATER = [408, 429]; // refusals of now, as any 5xx; all others stand
@@ -26,9 +27,15 @@ export function keepRight({ blackout: value }) {
   else localStorage.removeItem(RIGHT);
 }
 
-/** Every lamp and projector off. Sent until the service answers, over outages, restarts and reloads of the page. */
+let tried = null; // the try under way: {at (ms), abort}
+
+/** Every lamp and projector off. Sent until the service answers, over outages, restarts and reloads of the page;
+ * pressed again, a try that is not answered is made anew. */
 export async function blackout() {
-  if (pressed?.going) return;
+  if (pressed?.going) {
+    if (tried && Date.now() - tried.at > YIELD_MS) tried.abort.abort(new Error("pressed again"));
+    return;
+  }
   put({ at: Date.now(), going: true });
   await send();
 }
@@ -56,10 +63,11 @@ function put(next) {
 
 async function send() {
   tell("yield");
-  for (;;) {
+  for (let patience = PATIENCE_MS; ; patience = Math.min(2 * patience, MOST_PATIENCE_MS)) {
     const room = setTimeout(() => tell("yield all"), YIELD_MS);
+    tried = { at: Date.now(), abort: new AbortController() };
     try {
-      const more = { patience: PATIENCE_MS, priority: "high", headers: rightHeader() };
+      const more = { signal: tried.abort.signal, patience, priority: "high", headers: rightHeader() };
       const { safe, detail } = await ask("POST /devices/blackout", undefined, more);
       put({ at: pressed.at, answer: { at: Date.now(), safe, detail: local(detail) } });
       break;

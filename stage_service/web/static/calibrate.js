@@ -7,9 +7,9 @@ import { pictures } from "./pictures.js";
 import { S, busy, events } from "./state.js";
 
 const KINDS = {
-  boards: ["Board", "One capture a pose: six or more that every camera sees, tilted by 30° or more in several directions. Of each: corners, tilt, by how much the lens is off.", { lights: [], projectors: [] }],
-  diffuse: ["Diffuse sphere", "One capture a place: where the lights are, and how strong.", { projectors: [] }],
-  mirror: ["Mirror sphere", "One capture a place, exposed for the highlights: sharper directions.", { projectors: [] }],
+  boards: ["Board", "One capture per pose: six or more poses that every camera sees, tilted by 30° or more in several directions. Listed for each: corners, tilt, reprojection error.", { lights: [], projectors: [] }],
+  diffuse: ["Diffuse sphere", "One capture per place: positions and intensities of the lights.", { projectors: [] }],
+  mirror: ["Mirror sphere", "One capture per place, exposed for the highlights: sharper directions.", { projectors: [] }],
 };
 const LEAST = 8; // corners that count
 const LONGER = 40; // times the residuals are drawn
@@ -52,7 +52,7 @@ export function open(view) {
   const begin = button("Calibrate", () => attempt(solve), { kind: "go" });
   view.append(h("h1", "Calibrate"),
     h(".split", h("div", sections.map((s) => s.element), heading, grid),
-      h("aside.after", h("fieldset", h("legend", "the board"), board), h("fieldset", h("legend", "what else stands there"), props), h(".line", begin), wrong, found)));
+      h("aside.after", h("fieldset", h("legend", "the board"), board), h("fieldset", h("legend", "paper and spheres"), props), h(".line", begin), wrong, found)));
   let shown = kept.boards.at(-1) ?? null;
   let solution = null;
 
@@ -75,7 +75,7 @@ export function open(view) {
       rows.replaceChildren(...kept[kind].map((id) => h("tr", id === shown ? { class: "shown" } : {},
         h("th", { scope: "row" }, button(id, () => { shown = id; list(); show(); }, { kind: "quiet" })),
         ...(kind === "boards" ? S.rig.cameras.map((c) => cell(seen.get(`${id}/${c.name}`), c.name)) : []),
-        h("td.n", button("take out", () => { kept[kind] = kept[kind].filter((x) => x !== id); if (shown === id) shown = null; keep(); list(); show(); }, { kind: "quiet", "aria-label": `take out ${id}` })))));
+        h("td.n", button("remove", () => { kept[kind] = kept[kind].filter((x) => x !== id); if (shown === id) shown = null; keep(); list(); show(); }, { kind: "quiet", "aria-label": `remove ${id}` })))));
     }
     begin.disabled = !kept.boards.length || solution?.state === "running" || !S.who?.scopes.includes("jobs");
   }
@@ -105,7 +105,7 @@ export function open(view) {
     const steps = await get(`${captureAt(id)}/steps`, { signal: controller.signal }).catch(() => []);
     const lit = steps.find((s) => s.kind === "all_on") ?? steps.at(-1);
     if (id !== shown || !lit) return;
-    say(heading, `${id}: what the cameras see${kept.boards.includes(id) ? `; lines: where the ${solution?.rig ? "calibrated" : "nominal"} lens has each corner, ${LONGER} times as far off` : ""}`);
+    say(heading, `${id}: what the cameras see${kept.boards.includes(id) ? `; lines: reprojection error of the ${solution?.rig ? "calibrated" : "nominal"} lens, drawn ${LONGER} times as long` : ""}`);
     cells.show((camera) => `${captureAt(id)}/frames/${lit.index}/${encodeURIComponent(camera)}`, { words: "all lights", lacks: lit.lacks, figures: false, query: [], over: (name) => marks(seen.get(`${id}/${name}`)) });
   }
 
@@ -135,7 +135,7 @@ export function open(view) {
         ...view_.stages.flatMap((s) => s.warnings.map((w) => h("p.note", w))),
         ...view_.stages.flatMap((s) => Object.entries(s.figures.undetermined ?? {}).slice(0, 8).map(([k, why]) => h("p.quiet", `${k}: ${why}`))),
         view_.rig && h(".line", h("a.button", { href: "/calibration/rig.json", download: "rig.json" }, "Accept: download the rig file")),
-        view_.rig && h("p.quiet", "Serve with it (hairstage serve --rig rig.json). To repeat: take out the captures that are bad, shoot others, calibrate again."),
+        view_.rig && h("p.quiet", "Serve with it (hairstage serve --rig rig.json). To repeat: remove bad captures from the lists, shoot others, calibrate again."),
       ]),
     ].filter(Boolean));
     list();

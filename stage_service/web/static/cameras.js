@@ -18,14 +18,14 @@ export function open(view) {
   const marked = h("input", { type: "checkbox", checked: true, onchange: show });
   const figures = h("input", { type: "checkbox", checked: true, onchange: show });
   const take = steering("Take a snapshot", shoot, { kind: "go", lights: true, ready: () => !busy() });
-  const what = h("p.quiet", "A snapshot lights the stage for one exposure. It is kept until the next one, and is in no list.");
+  const what = h("p.quiet", "A snapshot lights the stage for one exposure. It is kept until the next one and is not listed among the captures.");
   const grid = h(".grid");
   const cells = pictures(grid, controller.signal);
   view.append(h("h1", "Cameras"),
     h("form.line", { onsubmit: (event) => { event.preventDefault(); attempt(shoot); } },
       h("label", h("span.quiet", "light "), light), h("label", h("span.quiet", "exposure, s "), exposure), h("label", h("span.quiet", "level "), level),
       h("label", h("span.quiet", "again "), again), take.element),
-    h(".line", h("label.check", marked, h("span", "mark what is saturated")), h("label.check", figures, h("span", "histogram, focus"))),
+    h(".line", h("label.check", marked, h("span", "mark saturated pixels")), h("label.check", figures, h("span", "histogram, focus"))),
     what, grid);
   let timer = 0;
 

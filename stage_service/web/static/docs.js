@@ -1,4 +1,4 @@
-// The API on a page, from /openapi.json: what there is to ask, with what, and a line that asks it.
+// The API on a page, from /openapi.json: each route, its fields, and a command line that calls it.
 
 import { h, say } from "./dom.js";
 
@@ -36,8 +36,8 @@ function operation(method, path, op, api) {
   return h("details", { id: op.operationId }, h("summary", h("code", h("b", method), ` ${path}`), h("span.quiet", ` ${op.description?.split(/\.\s/)[0] ?? op.summary ?? ""}`)),
     h("p", op.description),
     op.parameters?.length ? h("table", h("tbody", op.parameters.map((p) => h("tr", h("th", { scope: "row" }, h("code", p.name)), h("td", p.in), h("td", kind(p.schema)), h("td", p.description ?? ""))))) : "",
-    body ? [h("h3", "takes"), fieldsOf(body, api)] : "",
-    answer ? [h("h3", `answers ${good[0]}`), fieldsOf(answer.type === "array" ? answer.items : answer, api)] : "",
+    body ? [h("h3", "request body"), fieldsOf(body, api)] : "",
+    answer ? [h("h3", `response ${good[0]}`), fieldsOf(answer.type === "array" ? answer.items : answer, api)] : "",
     h("pre", { tabindex: "0" }, h("code", line)));
 }
 
@@ -51,7 +51,7 @@ try {
       groups.get(tag).push(operation(method.toUpperCase(), path, op, api));
     }
   }
-  say(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route but the open ones asks for a token; problems are ", h("a", { href: "/docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "/openapi.json" }, "openapi.json"), ". The ", h("a", { href: "/" }, "console"), "."),
+  say(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route except the open ones needs a token. Problem types are ", h("a", { href: "/docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "/openapi.json" }, "openapi.json"), ". The ", h("a", { href: "/" }, "console"), "."),
     ...[...groups].map(([tag, rows]) => h("section.api", { "aria-label": tag }, h("h2", tag), rows)));
 } catch (error) {
   say(view, h("p.bad", `/openapi.json: ${error.message}`));

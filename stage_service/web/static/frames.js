@@ -14,7 +14,7 @@ export function open(view, [asked]) {
   const list = h(".list", { role: "group", "aria-label": "captures" });
   const older = button("older", () => turn(PAGE), { kind: "quiet" });
   const newer = button("newer", () => turn(-PAGE), { kind: "quiet" });
-  const which = h("select", { "aria-label": "captures that", onchange: () => { offset = 0; loadList(); } },
+  const which = h("select", { "aria-label": "captures by outcome", onchange: () => { offset = 0; loadList(); } },
     ["", "completed", "aborted", "failed", "interrupted", "damaged"].map((x) => h("option", { value: x }, x || "all captures")));
   const detail = h("section");
   view.append(h(".side", h("section", { "aria-label": "captures" }, h("h1", "Captures"), which, list, h(".line", newer, older)), detail));
@@ -35,7 +35,7 @@ export function open(view, [asked]) {
       const element = h("button", { type: "button", onclick: () => choose(c.id) }, name);
       return { element, tell(x) { say(name, x.id, h("br"), h(`small${x.outcome === "failed" || x.outcome === "damaged" ? ".bad" : ""}`, `${x.outcome ?? x.state}, ${number(x.frames_written)} of ${number(x.frames_planned)} frames`)); element.dataset.id = x.id; } };
     });
-    if (!found.length) say(list, h("p.quiet", offset ? "There are no older ones." : "There are none."));
+    if (!found.length) say(list, h("p.quiet", offset ? "No older captures." : "No captures."));
     newer.disabled = offset === 0;
     older.disabled = found.length < PAGE;
     mark();
@@ -80,7 +80,7 @@ function captureOf(view, id) {
   const acts = h(".line");
   const slider = h("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "step", oninput: () => { stopFilm(); show(); } });
   const where = h("output", "");
-  const kinds = h("select", { "aria-label": "steps that", onchange: pick }, [["olat", "each light"], ["scanline", "the sweep"], ["all", "all steps"]].map(([v, t]) => h("option", { value: v }, t)));
+  const kinds = h("select", { "aria-label": "steps by kind", onchange: pick }, [["olat", "each light"], ["scanline", "the sweep"], ["all", "all steps"]].map(([v, t]) => h("option", { value: v }, t)));
   const same = h("input", { type: "checkbox", checked: true, onchange: () => { white = null; show(); } });
   const marked = h("input", { type: "checkbox", onchange: show });
   const figures = h("input", { type: "checkbox", onchange: show });
@@ -90,7 +90,7 @@ function captureOf(view, id) {
   let chosen = [];
   view.replaceChildren(title, facts, acts,
     h(".scrub", h(".line", kinds, play), slider, where),
-    h(".line", h("label.check", same, h("span", "one exposure for all lights")), h("label.check", marked, h("span", "mark what is saturated")), h("label.check", figures, h("span", "histogram, focus"))),
+    h(".line", h("label.check", same, h("span", "one exposure for all lights")), h("label.check", marked, h("span", "mark saturated pixels")), h("label.check", figures, h("span", "histogram, focus"))),
     grid);
 
   async function load() {
@@ -122,7 +122,7 @@ function captureOf(view, id) {
     stopFilm();
     chosen = steps.filter((s) => s.lacks.length < S.rig.cameras.length && (kinds.value === "all" || s.kind === kinds.value));
     slider.disabled = chosen.length < 2;
-    if (!chosen.length) say(where, "no frame of these yet");
+    if (!chosen.length) say(where, "no frames of these steps yet");
     slider.max = Math.max(0, chosen.length - 1);
     slider.value = Math.min(slider.value, slider.max);
     white = null;

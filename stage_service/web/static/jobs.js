@@ -2,7 +2,7 @@
 
 import { attempt } from "./acts.js";
 import { ask, get } from "./ask.js";
-import { button, bytes, clock, h, keyed, number, percent, say, seconds, svg, words } from "./dom.js";
+import { button, bytes, clock, h, keyed, local, number, percent, say, seconds, svg, words } from "./dom.js";
 import { S, changed, events, load } from "./state.js";
 
 export function open(view, [asked]) {
@@ -21,7 +21,7 @@ export function open(view, [asked]) {
   }
 
   function update() {
-    say(none, S.jobsProblem ?? (S.jobs?.length ? "" : "There are no jobs: a capture that names a pipeline makes one when it is complete."));
+    say(none, S.jobsProblem ?? (S.jobs?.length ? "" : "No jobs. A capture whose plan names a pipeline enqueues one when it is complete."));
     keyed(list, S.jobs ?? [], (j) => j.id, (j) => {
       const name = h("span");
       const share = h("progress", { max: 1, "aria-label": "done" });
@@ -89,12 +89,12 @@ function jobOf(view, id) {
     const rows = {
       "Pipeline": job.pipeline, "State": job.outcome ?? job.state, "Capture": job.capture.split("/").at(-1), "Model": job.model.split("/").at(-1),
       "Begun": clock(job.started), "Took": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
-      ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}, if steps take alike` } : {}),
+      ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}, if all steps take equally long` } : {}),
     };
     say(facts, ...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
-    say(wrong, job.error ? `${job.error.type}: ${job.error.detail}` : "");
+    say(wrong, job.error ? `${local(job.error.detail)} (${job.error.type})` : "");
     wrong.hidden = !job.error;
-    say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "It waits for a worker." : "");
+    say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "Queued until a worker is free." : "");
     meter.hidden = job.state !== "running";
     what.hidden = job.state === "done";
     look().catch(() => { last = ""; });
@@ -130,7 +130,7 @@ function jobOf(view, id) {
   function filesOf(list) {
     const link = (path) => `/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
     const has = (path) => list.some((f) => f.path === path);
-    page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "the report on a page of its own"))] : []),
+    page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "open the report in a new page"))] : []),
       ...["relit.webp", "relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));
     timed.hidden = stages.childElementCount === 0;
     files.hidden = list.length === 0;

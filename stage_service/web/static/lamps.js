@@ -10,7 +10,7 @@ const WORDS = {
   dark: { bar: "dark", tone: "calm", headline: "Dark, verified", lit: "nothing is lit", fact: "dark, verified" },
   doubted: { bar: "reported dark", tone: "warn", headline: "Reported dark", lit: "the light bank reports no lamp lit", fact: "reported dark" },
   said: {
-    bar: "said to be dark", tone: "warn", headline: "Said to be dark", lit: "nothing is lit, says who has looked", fact: "said to be dark",
+    bar: "said to be dark", tone: "warn", headline: "Said to be dark", lit: "no lamp is lit, as a person who looked reports", fact: "said to be dark",
   },
   accepted: {
     bar: "off was sent", tone: "warn", headline: "Off was sent, not read back", lit: "off was sent; the light bank cannot report what is lit",

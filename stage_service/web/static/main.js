@@ -117,7 +117,7 @@ function onPressed() {
   if (!answer || S.out) return;
   const took = seconds((answer.at - pressed.at) / 1000);
   load.health().catch(() => {}).then(() => {
-    if (!answer.safe) notice(`Blackout: ${answer.detail}`, "bad");
+    if (!answer.safe) notice(S.health?.latch ? "Blackout: unknown, unsafe, for the reason above." : `Blackout: ${answer.detail}`, "bad");
     else notice(`${lampWords(S.health).state === "doubted" ? "Reported dark" : "Dark, verified"}, after ${took}.`, "good");
   });
 }

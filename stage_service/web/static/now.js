@@ -74,7 +74,7 @@ export function open(view) {
     pause.element.hidden = !busy() || ["paused", "pausing"].includes(c?.state);
     resume.element.hidden = !["paused", "pausing"].includes(c?.state);
     finish.element.hidden = busy() || !c || ["completed", "damaged"].includes(c.outcome) || unlit() !== null;
-    fresh.hidden = unlit() !== null;
+    fresh.hidden = unlit() !== null || silence() !== null;
     goOn.element.hidden = S.queue.hold === null;
     queueOf();
     if (!c) {
@@ -128,7 +128,7 @@ export function open(view) {
       return;
     }
     headlineOfLamps();
-    const last = busy() ? `${HEADLINES[c.state]}, step ${number(c.step)} of ${number(c.steps)}.` : `Capture ${c.id} ${HOW[c.outcome]}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`;
+    const last = busy() ? `${HEADLINES[c.state].toLowerCase()}, step ${number(c.step)} of ${number(c.steps)}.` : `Capture ${c.id} ${HOW[c.outcome]}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`;
     say(said, silent ? `Last known at ${silent.clock}: ${last}` : last);
   }
 
@@ -162,12 +162,13 @@ export function open(view) {
   function showLights(c, p) {
     const running = ["running", "pausing", "aborting"].includes(c.state) && !silence();
     const now = running && p ? p : {};
+    const last = silence() && busy() && p ? p : {}; // lit when the service was last heard
     const shot = new Set((steps ?? []).slice(0, c.step).map((s) => s.light).filter(Boolean));
     picture.show({
       lit: now.kind === "all_on" ? "all" : now.light ?? null,
       shot, missing: lacking(),
       projector: now.kind === "tracking" ? "all" : now.projector ?? null,
-      doubt: suspects(),
+      doubt: last.kind === "all_on" ? new Set(S.rig.lights.map((x) => x.name)) : last.light ? new Set([last.light]) : suspects(),
     });
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);

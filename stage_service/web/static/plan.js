@@ -42,7 +42,7 @@ export function open(view) {
       h("h1", "Plan a capture"),
       h(".presets", { role: "group", "aria-label": "presets" }, Object.entries(PRESETS).map(([name, make]) => h("button", { type: "button", onclick: () => { form.fill(make()); typed(); } }, name))),
       form.element,
-      h("fieldset", h("legend", "lights"), h("p.quiet", "Click lights to choose them; none chosen means all."), h(".picker", picker.element)),
+      h("fieldset", h("legend", "lights"), h("p.quiet", "Click lights to choose them. Without a choice all are shot."), h(".picker", picker.element)),
       then.element,
       h("details", h("summary", "how a plan is read"), h("p.quiet", schemas.CapturePlan.description)),
     );
@@ -76,7 +76,7 @@ export function open(view) {
       const problems = error.data?.problems ?? error.data?.errors?.map((e) => `${e.loc}: ${e.msg}`) ?? [error.message];
       say(side, h("h2", "This cannot be shot"), h("ul.problems", problems.map((text) => h("li", text))));
     }
-    side.append(arming, h(".line", start.element, queue.element), h("p.quiet", "Starting takes the lease: others may abort and black out, but not steer, until you release it."));
+    side.append(arming, h(".line", start.element, queue.element), h("p.quiet", "Starting takes the lease: until you release it, others may abort and send Blackout, but not steer."));
     update();
   }
 
@@ -97,7 +97,7 @@ export function open(view) {
         "Flashes": h(f.needs_consent ? "b.warn" : "span", `${f.hz ? `${number(f.hz)} Hz, ` : ""}${f.band}`), "Limited by": c.limited_by,
       }).map(([name, value]) => h("div", h("dt", name), h("dd", value)))),
       h(".bars", causes.map(([name, s]) => [h("span", words(name)), h("progress", { max: most, value: s, "aria-label": name }), h("span.n", seconds(s))])),
-      f.needs_consent ? h("p.note", "Flashes of 3 to 30 Hz before a living subject: write their consent into the plan and say who answers, or take the preset “slow, for eyes”.") : null,
+      f.needs_consent ? h("p.note", "Flashes of 3 to 30 Hz before a living subject: record the consent in the plan and name who answers for it at the stage, or choose the preset “slow, for eyes”.") : null,
       h("p.quiet", c.stepping_why),
       c.left_out.map((x) => h("p.note", `Left out: ${x.what}: ${x.why} (saves ${x.saved})`)),
     ];
@@ -114,7 +114,7 @@ export function open(view) {
 
   async function enqueue() {
     await ask("POST /queue", wanted());
-    notice("it waits in the queue");
+    notice("The capture is in the queue.");
   }
 
   function update() {

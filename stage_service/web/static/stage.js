@@ -2,7 +2,7 @@
 
 import { attempt } from "./acts.js";
 import { ask, get } from "./ask.js";
-import { button, bytes, clock, h, keyed, number, say, words } from "./dom.js";
+import { button, bytes, clock, h, keyed, local, number, say, words } from "./dom.js";
 import { doubt, lampState, lampWords } from "./lamps.js";
 import { S, events, load } from "./state.js";
 
@@ -19,9 +19,9 @@ export function open(view) {
   devices.style.setProperty("--cell", "16rem");
   view.append(
     h("h1", "The stage"), health, problems,
-    h("section.devices", h(".line", h("h2", "Devices"), button("Ask them again", askAll, { kind: "quiet" }), age), devices),
+    h("section.devices", h(".line", h("h2", "Devices"), button("Query them again", askAll, { kind: "quiet" }), age), devices),
     h("section", h("h2", "Who steers"), lease),
-    h("section", h("h2", "Who did what"), h(".wide", { tabindex: "0", role: "region", "aria-label": "audit log" }, h("table", h("thead", h("tr", ["when", "who", "what", "on", "came to", "because"].map((x) => h("th", x)))), rows))),
+    h("section", h("h2", "Audit log"), h(".wide", { tabindex: "0", role: "region", "aria-label": "audit log" }, h("table", h("thead", h("tr", ["time", "who", "action", "subject", "result", "reason"].map((x) => h("th", x)))), rows))),
   );
 
   let all = []; // the devices, as they were seen last
@@ -29,7 +29,7 @@ export function open(view) {
     const found = await attempt(() => get("/devices"));
     if (!found) return;
     const { cameras = {}, safety, age_s: seen, projector_power: power = {}, ...single } = found;
-    say(age, seen === null ? "not asked yet" : `asked ${number(Math.round(seen))} s ago`);
+    say(age, seen === null ? "not queried yet" : `queried ${number(Math.round(seen))} s ago`);
     all = [...Object.entries(single), ...Object.entries(cameras).map(([k, v]) => [`camera ${k}`, v]), ...Object.entries(power).map(([k, v]) => [`power of ${k}`, v])].filter(([, v]) => v && typeof v === "object");
     tellDevices();
   }
@@ -58,7 +58,7 @@ export function open(view) {
   async function askAudit() {
     const found = await attempt(() => get("/audit?limit=200"));
     if (!found) return;
-    rows.replaceChildren(...found.reverse().map((a) => h("tr", h("td.n", clock(a.time)), h("td", a.who), h("td", a.action), h("td", a.subject), h(["ok", "dark", "completed"].includes(a.result) ? "td" : "td.warn", a.result), h("td", a.detail))));
+    rows.replaceChildren(...found.reverse().map((a) => h("tr", h("td.n", clock(a.time)), h("td", a.who), h("td", a.action), h("td", a.subject), h(["ok", "dark", "completed"].includes(a.result) ? "td" : "td.warn", a.result), h("td", local(a.detail)))));
   }
 
   let timer = 0;
@@ -72,11 +72,11 @@ export function open(view) {
     if (!x) return;
     tellDevices();
     const lamps = lampWords(x);
-    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs wait", "Lamps": x.problems.includes(x.lamps_detail) ? lamps.fact : `${lamps.fact}: ${lamps.detail}`, "Root folder": x.root };
+    const facts = { "Service": `${x.status}, version ${x.version}`, "Rig": x.rig, "Disk": `${bytes(x.disk_free_bytes)} free`, "Worker": x.worker ? "runs" : "none runs: jobs stay queued", "Lamps": x.problems.includes(x.lamps_detail) ? lamps.fact : `${lamps.fact}: ${lamps.detail}`, "Root folder": x.root };
     say(health, ...Object.entries(facts).map(([k, v]) => h(v.length > 40 ? "div.long" : "div", h("dt", k), h("dd", v))));
     say(problems, ...x.problems.map((text) => h("li", text)));
     const held = S.lease.holder;
-    say(lease, held === null ? "Nobody in particular: anybody may steer." : `${held}, until ${clock(S.lease.expires)}.`,
+    say(lease, held === null ? "Nobody holds the lease: anybody may steer." : `${held}, until ${clock(S.lease.expires)}.`,
       held !== null && S.who?.scopes.includes("admin") ? button("end this lease", () => attempt(async () => { await ask("DELETE /lease?force=true"); await load.lease(); }), { kind: "quiet" }) : "");
   }
   return { update, end() { clearTimeout(timer); for (const kind of TOLD) events.removeEventListener(kind, onEvent); } };

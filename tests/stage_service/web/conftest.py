@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
 from browsing import Pages
+from filming import Film
 from serving import Client, serving
 
 from simulators.peers.faults import Fault
@@ -24,6 +27,15 @@ def browser() -> Iterator[Any]:
         browser = p.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Film:
+    """HAIRSTAGE_FILM=folder keeps its pictures."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe here")
+    folder = Path(os.environ.get("HAIRSTAGE_FILM", tmp_path / "film"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return Film(folder, axe.Axe())
 
 
 @pytest.fixture

@@ -236,7 +236,9 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     page.fill("[name=name]", "Ada")
     page.fill("[name=note]", "all dark")
     page.click("text=I looked")
-    assert not told("Said to be dark", "said to be dark", "nothing is lit, says who has looked")
+    assert not told(
+        "Said to be dark", "said to be dark", "no lamp is lit, as a person who looked reports"
+    )
     page.keyboard.press("F9")
     assert "A blackout cannot find out" in told("Off was sent, not read back", "off was sent", sent)
 
@@ -507,7 +509,7 @@ def test_an_open_job_shows_what_its_end_left_and_is_run_again_as_it_was_asked_fo
     asked = {"capture": capture, "pipeline": pipeline, "model": "mine"}
     job = http.post("/jobs", json=asked).json()["id"]
     page = pages.open(f"jobs/{job}")
-    page.wait_for_selector(".said:has-text('It waits for a worker.')")
+    page.wait_for_selector(".said:has-text('Queued until a worker is free.')")
     Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
     http.delete(f"/jobs/{job}").raise_for_status()
     page.wait_for_selector("dd:text-is('cancelled')")

@@ -1,0 +1,368 @@
+"""Blackout by its button and by F9 in every state of the page, checked at the simulated bank."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from browsing import Pages, says
+from filming import BRIGHTEST, SIZES
+from simulating import simulating, small_rig_text
+from waiting import machine_slack, until
+
+from simulators.peers.devices import DEVICES_FILE
+from simulators.peers.faults import Fault
+from stage_service.records.tokens import Tokens, own_token
+
+LIT = {
+    "projectors": [],
+    "sentinels": False,
+    "stepping": "software",
+    "exposure": {"olat": 0.1},
+    "rate_hz": 4,
+}
+LIGHTS = 300
+"""A capture of so many, of which one is lit nearly half of the time, takes over a minute: it does
+not end before it is darkened, however busy the machine is."""
+SHOWN = SIZES if "HAIRSTAGE_FILM" in os.environ else ("desk",)
+EXPECTED_COMPLAINTS = ("401", "503", "ERR_")  # Chromium's own, of requests that a state refuses
+NOT_DARKENED = "Log in again. The stage was NOT darkened: press the wired emergency stop."
+
+
+class Desk:
+    """A stage, the process of its service, and pages of its console."""
+
+    def __init__(self, folder: Path, browser: Any, rig_file: Any, world: Any) -> None:
+        self.root, self.world, self._browser = folder / "root", world, browser
+        self._rig, self.watchdog_s = rig_file.path, rig_file.devices.watchdog_s
+        self._opened: list[Pages] = []
+        self.lease: dict[str, str] = {}
+        self.tokens = Tokens(self.root / "tokens.json", own_token())
+        self.port = 0
+        self.start()
+        self.tokens.make("reader", ("read",))
+
+    def start(self) -> None:
+        """Start the service, at the same port as before."""
+        devices = self._rig.with_suffix("") / DEVICES_FILE
+        command = [
+            sys.executable,
+            "-m",
+            "stage_service.cli",
+            "serve",
+            "--json",
+            "--port",
+            self.port,
+        ]
+        command += ["--rig", self._rig, "--devices", devices, "--root", self.root]
+        self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.url = json.loads(self.process.stdout.readline())["url"]
+        self.port = httpx.URL(self.url).port or 0
+        headers = {"Authorization": f"Bearer {own_token()}"}
+        self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
+
+    def kill(self) -> None:
+        """End the service at once."""
+        self.http.close()
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    @property
+    def lit(self) -> bool:
+        """Whether a lamp is on, by the bank itself."""
+        return bool(self.world.lamps.power().any())
+
+    def light(self) -> str:
+        """Begin a capture, and wait for one of its lamps; returns its id.
+
+        A blackout that a page sent while the service was away may still end one before that.
+        """
+        while True:
+            until(lambda: self.http.get("/health").json()["capture"] is None)
+            answer = self.http.post("/captures", json={"plan": LIT}, headers=self.lease)
+            assert answer.status_code == 202, answer.text
+            path = f"/captures/{answer.json()['id']}"
+            until(lambda path=path: self.lit or self.http.get(path).json()["outcome"])
+            if self.lit:
+                return str(answer.json()["id"])
+
+    def outcome(self, capture: str) -> str:
+        """How a capture that is about to end has ended."""
+        return str(until(lambda: self.http.get(f"/captures/{capture}").json()["outcome"]))
+
+    def pages(self) -> Pages:
+        """A browser of its own."""
+        self._opened.append(Pages(self._browser, self.url))
+        return self._opened[-1]
+
+    def page(self, token: str | None = None) -> Any:
+        """A page that is logged in by this token, the operator's own by default."""
+        return self.pages().open_as(token or own_token())
+
+    def settle(self) -> None:
+        """As it was: no capture, no lease, no page; says what pages complained of unexpectedly."""
+        if self.process.poll() is not None:
+            self.start()
+        self.process.send_signal(signal.SIGCONT)
+        self.http.post("/devices/blackout")
+        self.http.delete("/lease?force=true")
+        self.lease = {}
+        for pages in self._opened:
+            pages.close()
+        told = [text for pages in self._opened for text in pages.complaints]
+        self._opened.clear()
+        assert [x for x in told if not any(y in x for y in EXPECTED_COMPLAINTS)] == []
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[Callable[..., Desk]]:
+    """`stage(*faults)`: the desk of a stage with these faults, one for all states."""
+    slack, desks = machine_slack(), {}
+    rig = small_rig_text(slack).replace("lights = 24", f"lights = {LIGHTS}")
+    with simulating(tmp_path_factory.mktemp("desk"), rig, slack) as start:
+
+        def of(*faults: Fault) -> Desk:
+            if faults not in desks:
+                folder = tmp_path_factory.mktemp("service")
+                desks[faults] = Desk(folder, browser, *start(*faults))
+            return desks[faults]
+
+        yield of
+        for desk in desks.values():
+            desk.kill()
+
+
+@pytest.fixture
+def desk(stage: Callable[..., Desk]) -> Iterator[Desk]:
+    yield stage()
+    stage().settle()
+
+
+def f9(page: Any) -> None:
+    page.keyboard.press("F9")
+
+
+def button(page: Any) -> None:
+    page.click("button.blackout")
+
+
+# Each state: brings a page into it while a lamp is lit, and returns the page.
+
+
+def shooting(desk: Desk) -> Any:
+    page = desk.page()
+    desk.light()
+    page.wait_for_selector("circle.light.lit")
+    return page
+
+
+def second_tab(desk: Desk) -> Any:
+    pages = desk.pages()
+    first, second = pages.open_as(own_token()), pages.open()
+    desk.light()
+    for page in (first, second):
+        says(page, "Shooting")
+    return second
+
+
+def somebody_elses_lease(desk: Desk) -> Any:
+    page = desk.page()
+    lease = desk.http.post("/lease", json={"holder": "Eve", "seconds": 600}).json()
+    desk.lease = {"Hairstage-Lease": lease["token"]}
+    desk.light()
+    page.wait_for_selector("text=Eve steers")
+    return page
+
+
+def read_only_token(desk: Desk) -> Any:
+    desk.tokens.revoke("reader")
+    page = desk.page(desk.tokens.make("reader", ("read",)))
+    desk.light()
+    says(page, "Shooting")
+    assert page.query_selector("text=take") is None or not page.is_visible("text=take")
+    return page
+
+
+def events_refused(desk: Desk) -> Any:
+    pages = desk.pages()
+    detail = json.dumps({"detail": "256 listeners follow the events already"})
+    refusal = {"status": 503, "body": detail, "content_type": "application/problem+json"}
+    page = pages.open_as(
+        own_token(), lambda page: page.route("**/events", lambda r: r.fulfill(**refusal))
+    )
+    desk.light()
+    says(page, "Shooting")
+    page.wait_for_selector(".alarm:has-text('The service refuses live events to this page')")
+    return page
+
+
+def login_ended(desk: Desk) -> Any:
+    page = desk.page()
+    desk.light()
+    page.context.request.post(f"{desk.url}/logout")
+    page.wait_for_selector(".alarm:has-text('Your login has ended')")
+    return page
+
+
+def token_revoked(desk: Desk) -> Any:
+    page = desk.page(desk.tokens.make("bob", ("read", "steer")))
+    desk.light()
+    desk.tokens.revoke("bob")
+    page.wait_for_selector(".alarm:has-text('Your login has ended')")
+    return page
+
+
+ANSWERED = {
+    state.__name__: state
+    for state in (
+        shooting,
+        second_tab,
+        somebody_elses_lease,
+        read_only_token,
+        events_refused,
+        login_ended,
+        token_revoked,
+    )
+}
+
+
+@pytest.mark.parametrize("state", ANSWERED)
+def test_blackout_where_the_service_answers(state, desk, film):
+    for press in (f9, button):
+        page = ANSWERED[state](desk)
+        if press is f9:
+            film.take(page, f"{state}_before", sizes=SHOWN, brightest=2 * BRIGHTEST)
+        press(page)
+        page.wait_for_selector(
+            "#notices:has-text('Dark, verified'), .alarm:has-text('Dark, verified')"
+        )
+        (last,) = desk.http.get("/captures?limit=1").json()
+        assert desk.outcome(last["id"]) == "aborted"
+        assert not desk.lit
+        if press is f9:
+            film.take(page, f"{state}_after", sizes=SHOWN, brightest=2 * BRIGHTEST)
+        desk.settle()
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def test_a_page_that_was_never_logged_in_shows_that_it_cannot_darken(desk, film):
+    for press in (f9, button):
+        page = desk.pages().open()
+        page.wait_for_selector(".alarm:has-text('This page cannot darken the stage.')")
+        capture = desk.light()
+        press(page)
+        page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})")
+        assert desk.http.get(f"/captures/{capture}").json()["state"] == "running"
+        if press is f9:
+            film.take(page, "never_logged_in", sizes=SHOWN, brightest=2 * BRIGHTEST)
+        page.fill("[name=token]", own_token())
+        page.keyboard.press("Enter")
+        assert desk.outcome(capture) == "aborted"
+        page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})", state="detached")
+        assert not desk.lit
+        desk.settle()
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def test_a_lamp_that_stays_lit_is_named_whenever_blackout_is_pressed(stage, film):
+    desk = stage(Fault("lights", "stuck", 5))
+    page = desk.page()
+    desk.light()
+    says(page, "UNSAFE")
+    (lamp,) = desk.world.lamps.power().nonzero()[0]
+    for press in (f9, button):
+        press(page)
+        page.wait_for_selector(".notice:has-text('unknown, unsafe')")
+        assert desk.lit
+        assert f"light_{lamp:03d} was lit last" in page.text_content(".alarm.latch")
+        assert page.text_content("circle.doubt title") == f"light_{lamp:03d}"
+        assert "verified" not in page.text_content("body")
+        for offered in ("Shoot what is missing", "New capture"):
+            assert not page.is_visible(f"text={offered}")
+    film.take(page, "unsafe", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def no_answer(page: Any, desk: Desk) -> None:
+    """The page claims nothing of now while nothing comes from the service."""
+    page.wait_for_selector("h1:has-text('No answer since')")
+    page.wait_for_selector("circle.light.lit", state="detached")
+    alarm = page.text_content(".alarm:has-text('No answer from the service since')")
+    assert "the light bank's watchdog puts the lamps off" in alarm
+    assert f"{desk.watchdog_s:g} s after the service's last heartbeat" in alarm
+    for claim in ("Dark, verified", "Shooting"):
+        assert not page.is_visible(f"h1:has-text({claim!r})")
+    assert "left" not in page.text_content("#top .detail")
+
+
+def frozen_or_dead(desk: Desk) -> dict[Callable[[Any], None], Any]:
+    """A page for each way to press, that shows a lit lamp."""
+    pages = {press: desk.page() for press in (f9, button)}
+    desk.light()
+    for page in pages.values():
+        page.wait_for_selector("circle.light.lit")
+    return pages
+
+
+def press_unanswered(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> None:
+    """The service has just stopped: the bank's watchdog puts the lamps off, no page claims to."""
+    until(lambda: not desk.lit)
+    for press, page in pages.items():
+        no_answer(page, desk)
+        press(page)
+    for page in pages.values():
+        alarm = page.wait_for_selector(".alarm:has-text('has not been answered for')")
+        assert "Press the wired emergency stop" in alarm.text_content()
+
+
+@pytest.mark.parametrize("login", ["kept", "ended"])
+def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
+    pages = frozen_or_dead(desk)
+    desk.kill()
+    press_unanswered(desk, pages)
+    if login == "kept":
+        film.take(pages[f9], "no_connection", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    else:
+        (desk.root / "logouts.json").unlink()  # ends all logins, and no blackout right
+    desk.start()
+    done = "#notices" if login == "kept" else ".alarm"
+    for page in pages.values():
+        page.wait_for_selector(f"{done}:has-text('Dark, verified')")
+        page.wait_for_selector(".alarm:has-text('has not been answered for')", state="detached")
+    actions = [a["action"] for a in desk.http.get("/audit").json()]
+    assert actions[-2:] == ["blackout", "blackout"]
+    if login == "ended":
+        pages[f9].wait_for_selector("form.login")
+        film.take(pages[f9], "login_lost_in_a_restart", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    for press, page in pages.items():  # open since before the restart
+        capture = desk.light()
+        press(page)
+        assert desk.outcome(capture) == "aborted"
+        assert not desk.lit
+    if login == "kept":
+        film.take(pages[f9], "restarted", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    assert film.wrong == [], "\n".join(film.wrong)
+
+
+def test_blackout_over_a_frozen_service_is_shown_as_not_answered(desk, film):
+    pages = frozen_or_dead(desk)
+    desk.process.send_signal(signal.SIGSTOP)
+    press_unanswered(desk, pages)
+    film.take(pages[f9], "frozen", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    desk.process.send_signal(signal.SIGCONT)
+    for page in pages.values():
+        page.wait_for_selector("#notices:has-text('Dark, verified'), #notices:has-text('Reported')")
+        page.wait_for_selector(".alarm:has-text('No answer from the service')", state="detached")
+    assert not desk.lit
+    assert film.wrong == [], "\n".join(film.wrong)
