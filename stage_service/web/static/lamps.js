@@ -39,7 +39,7 @@ export function lampState(health) {
  * known; `alarm`, in two parts, is what has to be read where no latch stands for it. */
 export function lampWords(health) {
   const state = lampState(health);
-  const detail = (health?.lamps_detail ?? "").replace(/^unknown, unsafe: /, "").replace(/([^.])$/, "$1.");
+  const detail = (health?.lamps_detail ?? "").replace(/^unknown, unsafe: /, "").replace(/^./, (first) => first.toUpperCase()).replace(/([^.])$/, "$1.");
   const known = { ...WORDS[state], state, detail, alarm: alarm(state, health && detail) };
   const silent = silence();
   if (!silent) return known;

@@ -116,7 +116,7 @@ function onPressed() {
   const answer = pressed?.answer;
   if (!answer || S.out) return;
   const took = seconds((answer.at - pressed.at) / 1000);
-  load.health().catch(() => {}).then(() => {
+  load.now().catch(() => {}).then(() => { // it has ended a capture, which no event may say
     if (!answer.safe) notice(S.health?.latch ? "Blackout: unknown, unsafe, for the reason above." : `Blackout: ${answer.detail}`, "bad");
     else notice(`${lampWords(S.health).state === "doubted" ? "Reported dark" : "Dark, verified"}, after ${took}.`, "good");
   });

@@ -250,6 +250,7 @@ def test_blackout_where_the_service_answers(state, desk, film):
         (last,) = desk.http.get("/captures?limit=1").json()
         assert desk.outcome(last["id"]) == "aborted"
         assert not desk.lit
+        page.wait_for_selector("#top .state:text-is('dark'), #top .state:text-is('not logged in')")
         if press is f9:
             film.take(page, f"{state}_after", sizes=SHOWN, brightest=2 * BRIGHTEST)
         desk.settle()
