@@ -49,7 +49,7 @@ from stage_service.service_models import (
     SnapshotRequest,
     StepView,
 )
-from stage_service.stopping import Step, end_all
+from stage_service.stopping import NotEnded, Step, end_all
 from stage_service.storage import NotThere, Storage
 from stage_service.submitting import NotFinished, Submitting
 from stage_service.trash import Removed
@@ -172,7 +172,7 @@ class Service:
                 return
             end_all(
                 [
-                    Step("lamps and capture", self._captures.close, LIGHTS_S),
+                    Step("lamps and capture", self._close_captures, LIGHTS_S),
                     Step("the queue", self.queue.close, OTHERS_S),
                     Step("reading captures again", self._verifier.close, OTHERS_S),
                     Step("the calibration", self.calibrating.close, OTHERS_S),
@@ -183,6 +183,11 @@ class Service:
             )
             end_all([Step("the audit log", self._close_audit, FLUSH_S)], self.not_ended)
             self._closed = True
+
+    def _close_captures(self) -> None:
+        self._captures.close()
+        if (capture := self._captures.running) is not None:
+            raise NotEnded(f"capture {capture} hangs: its folder is not finished")
 
     def _close_jobs(self) -> None:
         self._follower.close()

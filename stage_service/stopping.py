@@ -12,6 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,9 +29,14 @@ LEFT = 1
 """Exit status of a process that has left something unfinished."""
 
 
+class NotEnded(RuntimeError):
+    """What was to end goes on, and is not waited for any longer."""
+
+
 @dataclass(frozen=True)
 class Step:
-    """Something to end, named as the log has it, within `within_s` seconds."""
+    """Something to end, named as the log has it, within `within_s` seconds; `NotEnded` says why it
+    could not be ended."""
 
     name: str
     work: Callable[[], object]
@@ -39,7 +45,7 @@ class Step:
 
 def end_all(steps: Iterable[Step], left: list[str]) -> None:
     """Begin every step, in this order, and wait for each as long as it has from now. `left` has the
-    names of those that have not ended yet. What a step raises is logged: the others go on."""
+    names of those that have not ended yet, or failed; the log says why, and the others go on."""
     began, under_way = time.monotonic(), []
     for step in steps:
         left.append(step.name)
@@ -50,14 +56,16 @@ def end_all(steps: Iterable[Step], left: list[str]) -> None:
         try:
             over.result(max(0.0, began + step.within_s - time.monotonic()))
         except Exception as error:
-            if over.done():
-                log.exception("%s", step.name, exc_info=error)
-            else:
+            if not over.done():
                 log.error("%s: not ended within %g s", step.name, step.within_s)
+            else:
+                known = isinstance(error, NotEnded)
+                log.error("%s: %s", step.name, error, exc_info=None if known else error)
 
 
-def _ended(left: list[str], name: str, _over: object) -> None:
-    left.remove(name)
+def _ended(left: list[str], name: str, over: Future[object]) -> None:
+    if over.exception() is None:
+        left.remove(name)
 
 
 class Ending:
