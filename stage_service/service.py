@@ -54,7 +54,7 @@ from stage_service.storage import NotThere, Storage
 from stage_service.submitting import NotFinished, Submitting
 from stage_service.trash import Removed
 from stage_service.verification import Verification, Verifier
-from stage_service.viewer import Viewed, Viewing
+from stage_service.viewer import RemoteViewing, Source, Tracer
 from stage_service.watching import NotReady, Watching
 
 T = TypeVar("T")
@@ -104,8 +104,12 @@ class Service:
         self.watching = Watching(root, self._captures, self._queue, self._follower)
         self.decoder = Decoder()
         self.storage = Storage(root, self._captures, self._control, self._queue, self.decoder)
-        self.viewing = Viewing(
-            lambda: [m.name for m in self.storage.models()], self._viewed, self.decoder
+        self._tracer = Tracer(lambda: self._captures.running is not None)
+        self.viewing = RemoteViewing(
+            lambda: [m.name for m in self.storage.models()],
+            self._viewed,
+            self.decoder,
+            self._tracer,
         )
         self._verifier = Verifier(
             root / "verified.json",
@@ -158,6 +162,11 @@ class Service:
         """Captures on the disk that are not listed yet."""
         return self._captures.catalogue.unread
 
+    @property
+    def running(self) -> str | None:
+        """The id of the capture that is being shot; waits for nothing."""
+        return self._captures.running
+
     def take_stage(self) -> None:
         """Have the stage for this service alone. Raises `StageInUse`."""
         self._captures.stage.take()
@@ -177,6 +186,7 @@ class Service:
                     Step("reading captures again", self._verifier.close, OTHERS_S),
                     Step("the calibration", self.calibrating.close, OTHERS_S),
                     Step("the decoder", self.decoder.close, OTHERS_S),
+                    Step("the tracer", self._tracer.close, OTHERS_S),
                     Step("the job database", self._close_jobs, OTHERS_S),
                 ],
                 self.not_ended,
@@ -388,14 +398,16 @@ class Service:
         check_link(f"the capture {capture_id}", path)
         return path
 
-    def _viewed(self, name: str) -> Viewed:
-        """A model for the viewer, with the capture of its name or of the job that made it."""
-        model = self.storage.whole_model(name)
+    def _viewed(self, name: str) -> Source:
+        """Where a model for the viewer lies, with the capture of its name or of the job that made
+        it. Raises `NotThere`."""
+        model, captures = self.storage.whole_model(name).path, list[Path]()
         with suppress(UnknownCapture, CaptureError):
-            return Viewed(model, Capture(self.capture_path(name)))
-        with suppress(NoSuchJob, CaptureError):
-            return Viewed(model, Capture(self._queue.get(name).capture))
-        return Viewed(model)
+            captures.append(self.capture_path(name))
+        if not captures:
+            with suppress(NoSuchJob, CaptureError):
+                captures.append(Path(self._queue.get(name).capture))
+        return Source(model, tuple(captures))
 
     def devices(self) -> dict[str, Any]:
         """Each device and whether it answers; "safety": whether the lamps are known to be off."""

@@ -61,7 +61,9 @@ def serving(
 @contextmanager
 def listening_app(app: FastAPI, port: int = 0) -> Iterator[str]:
     """The URL of an application on a socket of its own."""
-    config = uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1, **limits())
+    config = uvicorn.Config(
+        app, log_level="critical", timeout_graceful_shutdown=1, **limits(app.state.places)
+    )
     server = uvicorn.Server(config)
     listener = socket.create_server(("127.0.0.1", port))
     thread = threading.Thread(target=server.run, args=([listener],))

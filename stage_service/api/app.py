@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,10 +29,24 @@ from stage_service.api import (
     store,
     viewing,
 )
-from stage_service.api.connections import LOOPBACK, QUEUED, limits, listening
+from stage_service.api.admission import Admission
+from stage_service.api.connections import (
+    HEADER_S,
+    LOOPBACK,
+    QUEUED,
+    allow_files,
+    files_allowed,
+    limits,
+    listening,
+    share,
+)
 from stage_service.api.downloads import Heads
+from stage_service.api.entrance import Entrance
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
+from stage_service.api.pace import Pace
+from stage_service.api.places import Places
+from stage_service.api.porch import Porch
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.records.refusals import Refusals
 from stage_service.service import Service
@@ -87,7 +103,7 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
     def errors() -> PlainTextResponse:
         return PlainTextResponse(errors_page(), media_type="text/markdown")
 
-    return _completed(app, access, service.refusals)
+    return _completed(app, access, service.refusals, lambda: service.running)
 
 
 def create_viewer(models: Viewing, access: Access) -> FastAPI:
@@ -98,32 +114,53 @@ def create_viewer(models: Viewing, access: Access) -> FastAPI:
     return _completed(app, access)
 
 
-def _completed(app: FastAPI, access: Access, refusals: Refusals | None = None) -> FastAPI:
-    """What every application of ours has: the viewer, problem documents, gate, safe headers."""
+def _completed(
+    app: FastAPI,
+    access: Access,
+    refusals: Refusals | None = None,
+    running: Callable[[], str | None] = lambda: None,
+) -> FastAPI:
+    """What every application of ours has: the viewer, problem documents, places, gate, safe
+    headers."""
+    app.state.places, app.state.pace = Places(share()), Pace(lambda: running() is not None)
+    app.state.access, app.state.running = access, running
     install_problems(app)
     for part in (viewing.page, viewing.reading, viewing.router):
         app.include_router(part)
     app.add_middleware(Faults)
     app.add_middleware(Heads)
+    app.add_middleware(Entrance, running=running)
     app.add_middleware(Gate, access=access, refusals=refusals)
     app.add_middleware(SafeHeaders)  # outside: what the gate refuses has them, too
     return app
 
 
 class _Announcing(uvicorn.Server):
-    """Says when requests are answered; once it is to stop, they have `REQUESTS_S`, and it ends by
-    `STOP_S` whatever hangs. A second signal leaves them no time."""
+    """Says when requests are answered; connections come to it over a porch. Once it is to stop,
+    requests have `REQUESTS_S`, and it ends by `STOP_S` whatever hangs. A second signal leaves them
+    no time."""
 
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI, ready: Callable[[], None]) -> None:
         super().__init__(config)
-        self._ready = ready
+        self._app, self._ready = app, ready
+        self._porch: Porch | None = None
+        self._admitting: set[asyncio.Task[object]] = set()
         self.ending: Ending | None = None
         self._not_ended: list[str] = []
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
+        await super().startup([])
+        state, encrypted = self._app.state, self.config.ssl is not None
+        admission = Admission(state.access, state.places, state.running)
+        self._porch = Porch(
+            admission.judge,
+            self._admit,
+            lambda: state.running() is not None,
+            files_allowed(),
+            encrypted=encrypted,
+        )
         for listener in sockets or ():
-            listener.listen(QUEUED)
+            self._porch.listen(listener, QUEUED)
         self._ready()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
@@ -149,13 +186,42 @@ class _Announcing(uvicorn.Server):
         requests = len(self.server_state.tasks)
         return f"{requests} requests" if requests else ""
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        if self._porch is not None:
+            self._porch.close()
+        await super().shutdown(sockets)
+
+    def _admit(self, link: socket.socket) -> None:
+        task = asyncio.get_running_loop().create_task(self._connect(link))
+        self._admitting.add(task)
+        task.add_done_callback(self._admitting.discard)
+
+    async def _connect(self, link: socket.socket) -> None:
+        """Serve a connection, once its encryption is agreed upon."""
+        encryption = self.config.ssl
+        with suppress(OSError):  # the client has gone, or does not encrypt
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._connection,
+                link,
+                ssl=encryption,
+                ssl_handshake_timeout=HEADER_S if encryption else None,
+            )
+
+    def _connection(self) -> asyncio.Protocol:
+        made: asyncio.Protocol = self.config.http_protocol_class(  # type: ignore[call-arg]
+            config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
+        return made
+
 
 class _Server(_Announcing):
     """Puts the lights off at the signal itself, and answers until everything has been closed:
     blackout and health, above all."""
 
-    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[], None]) -> None:
-        super().__init__(config, ready)
+    def __init__(
+        self, config: uvicorn.Config, app: FastAPI, service: Service, ready: Callable[[], None]
+    ) -> None:
+        super().__init__(config, app, ready)
         self._service, self._not_ended = service, service.not_ended
 
     def _close(self) -> None:
@@ -198,6 +264,7 @@ def serve_viewer(
     `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
     """
     with listening(LOOPBACK, port, None) as listener:
+        allow_files()
         url = Endpoint().url(listener.getsockname()[1])
         app = create_viewer(models, access)
         config = uvicorn.Config(
@@ -205,9 +272,9 @@ def serve_viewer(
             log_level="warning",
             access_log=False,
             timeout_graceful_shutdown=REQUESTS_S,
-            **limits(),
+            **limits(app.state.places),
         )
-        _Announcing(config, lambda: ready(url)).run(sockets=[listener])
+        _Announcing(config, app, lambda: ready(url)).run(sockets=[listener])
 
 
 def serve(
@@ -221,17 +288,19 @@ def serve(
     `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
     """
     with listening(endpoint.host, endpoint.port, endpoint.socket) as listener:
+        allow_files()
         url = endpoint.url(0 if endpoint.socket else listener.getsockname()[1])
+        app = create_app(service, access)
         config = uvicorn.Config(
-            create_app(service, access),
+            app,
             log_level="warning",
             access_log=False,
             timeout_graceful_shutdown=REQUESTS_S,
             ssl_certfile=endpoint.certificate,
             ssl_keyfile=endpoint.key,
-            **limits(),
+            **limits(app.state.places),
         )
-        server = _Server(config, service, lambda: ready(url))
+        server = _Server(config, app, service, lambda: ready(url))
         try:
             server.run(sockets=[listener])
         finally:

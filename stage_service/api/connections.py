@@ -1,51 +1,112 @@
-"""Connections: fewer than would take a capture's file descriptors, and none that only waits."""
+"""Connections: fewer than would take a capture's file descriptors, and none that only waits.
+
+A connection is in the hall until a request says whose it is; it takes one of its owner's places
+then, or stays where the one that has waited longest makes room for the next.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import resource
 import socket
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from starlette.types import Scope
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from stage_service.api.places import LIMITS, NoPlace, Owner, Places
+
 LOOPBACK = "127.0.0.1"
-MOST_CONNECTIONS = 512
-"""Half of the descriptors that `select`, and most systems, allow a process."""
-MOST_STREAMS = 256
-"""Of events, which never end: the other places are for requests."""
+HALL = 112
+"""Connections of which nobody knows whose they are, or whose owners have no place. With the places
+they are half of the descriptors that `select`, and most systems, allow a process."""
 HEADER_S = 5.0
 """A request's headers are there within this time."""
+KEPT_S = 60.0
+"""How long a connection of somebody who may steer waits for its next request: a blackout over it
+queues behind no new ones. Those of others wait for `HEADER_S`."""
+STALL_S, FLOOR = 5.0, 16 << 10
+"""An answer is ended of which fewer bytes a second are taken over so many seconds."""
 MOST_HEADER_BYTES = 16 << 10
-ACCEPTED, QUEUED = 32, 1024
-"""Connections that are accepted in one turn of the event loop, some turns before they count: few,
-or the descriptors run out meanwhile. And those that the kernel lets wait for that."""
-_NO_ROOM = b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
+QUEUED = 1024
+"""Connections that the kernel lets wait until they are accepted."""
+FILES = 8192
+"""Files that a service has itself allowed to open, where it may."""
+_NO_ROOM = (
+    b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 1\r\n"
+    b"content-length: 0\r\n\r\n"
+)
+_EXTENSION = "hairstage"
+
+
+class Hall:
+    """All connections of a service: those inside have no place among `places` yet."""
+
+    def __init__(self, places: Places, most: int = HALL) -> None:
+        self._places, self._most = places, most
+        self._inside: set[Connection] = set()
+        self._owned: set[Connection] = set()
+        self._watch: asyncio.TimerHandle | None = None
+
+    def enter(self, connection: Connection) -> bool:
+        """Let a new one in, if need be for the one that has waited longest; whether it is in."""
+        if self._watch is None:
+            self._look()
+        self._inside.add(connection)
+        return len(self._inside) <= self._most or _drop_longest(self._inside - {connection})
+
+    def own(self, connection: Connection, owner: Owner) -> None:
+        """Give it a place of its owner's, if need be that of one that waits for its client. Raises
+        `NoPlace`, and leaves it where it is."""
+        try:
+            self._places.take("connections", owner)
+        except NoPlace:
+            others = self._owned - {connection}
+            if not _drop_longest(c for c in others if c.owner == owner and c.parked is None):
+                raise
+            self._places.take("connections", owner)
+        self.leave(connection)
+        self._owned.add(connection)
+        connection.owner = owner
+
+    def leave(self, connection: Connection) -> None:
+        """It has gone, or is about to."""
+        self._inside.discard(connection)
+        self._owned.discard(connection)
+        if connection.owner is not None:
+            self._places.leave("connections", connection.owner)
+            connection.owner = None
+
+    def _look(self) -> None:
+        """End what nobody takes."""
+        loop = asyncio.get_running_loop()
+        for connection in [*self._inside, *self._owned]:
+            connection.look(loop.time())
+        self._watch = loop.call_later(1.0, self._look)
 
 
 class Connection(H11Protocol):
-    """uvicorn's connection with a deadline for headers, and a place for each that has a request.
+    """uvicorn's connection with deadlines for headers and for the taking of answers, in the `hall`
+    of its service."""
 
-    Where there are `most`, a new one takes the place of the one that has waited longest for its
-    request, or the rest of it: whoever holds connections open keeps nobody from a blackout.
-    """
-
-    most = MOST_CONNECTIONS
+    hall: ClassVar[Hall]
+    owner: Owner | None = None
     since = 0.0
+    gone = False
+    parked: asyncio.Task[Any] | None = None
+    """What waits for a place or a turn, and is cancelled where the connection ends."""
     _deadline: asyncio.TimerHandle | None = None
+    _stalled: tuple[float, int] | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.since = self.loop.time()
         self._expect_headers()
-        if len(self.connections) <= self.most:
-            return
-        others = [c for c in self.connections if isinstance(c, Connection) and c.waits]
-        oldest = min((c for c in others if c is not self), key=lambda c: c.since, default=None)
-        if oldest is not None:
-            oldest.drop()
-        else:
+        if not self.hall.enter(self):
+            self.hall.leave(self)
             transport.write(_NO_ROOM)
             transport.close()
 
@@ -53,27 +114,65 @@ class Connection(H11Protocol):
         super().data_received(data)
         self._expect_headers()
 
+    def handle_events(self) -> None:
+        super().handle_events()
+        if self.scope is not None:
+            self.scope.setdefault("extensions", {})[_EXTENSION] = {"connection": self}
+
     def connection_lost(self, exc: Exception | None) -> None:
-        self._forget_deadline()
+        self._end()
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
         self.since = self.loop.time()
         super().on_response_complete()
 
+    def resume_writing(self) -> None:
+        self._stalled = None
+        super().resume_writing()
+
+    def own(self, owner: Owner) -> None:
+        """Count it as `owner`'s from here on. Raises `NoPlace`."""
+        if owner != self.owner:
+            self.hall.own(self, owner)
+            self.timeout_keep_alive = int(KEPT_S if owner.steers else HEADER_S)
+
     @property
     def waits(self) -> bool:
-        """Whether no whole request is under way on it."""
-        return self._between or self.cycle.more_body
+        """Whether no whole request is under way on it, or one that waits for its turn."""
+        return self._between or self.cycle.more_body or self.parked is not None
 
     @property
     def _between(self) -> bool:
         return self.cycle is None or self.cycle.response_complete
 
+    def look(self, now: float) -> None:
+        """End it where its answer is not taken. Nothing is added to an answer that stands still, so
+        that what is left of it says how much was taken; one that is closed goes on until then."""
+        left = self.transport.get_write_buffer_size()
+        if not left or not (self.flow.write_paused or self._between):
+            self._stalled = None
+        elif self._stalled is None:
+            self._stalled = now, left
+        elif now - self._stalled[0] >= STALL_S:
+            if self._stalled[1] - left < FLOOR * (now - self._stalled[0]):
+                self.drop()
+            else:
+                self._stalled = now, left
+
     def drop(self) -> None:
         """End it, whatever it was about to say."""
+        self._end()
         self.connections.discard(self)
         self.transport.abort()
+
+    def _end(self) -> None:
+        self.gone = True
+        self.hall.leave(self)
+        self._forget_deadline()
+        if self.parked is not None:
+            self.parked.cancel()
+            self.parked = None
 
     def _expect_headers(self) -> None:
         if not self._between:
@@ -92,17 +191,50 @@ class Connection(H11Protocol):
             self._deadline = None
 
 
-def protocol() -> type[Connection]:
-    """`Connection` with as many places as this process has descriptors for."""
-    allowed = resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2
-    return type("Connection", (Connection,), {"most": min(MOST_CONNECTIONS, allowed)})
+def _drop_longest(connections: Iterable[Connection]) -> bool:
+    """Drop the one that has waited longest; whether any waits."""
+    waiting = (c for c in connections if c.waits)
+    longest = min(waiting, key=lambda c: c.since, default=None)
+    if longest is not None:
+        longest.drop()
+    return longest is not None
 
 
-def limits() -> dict[str, Any]:
+def connection_of(scope: Scope) -> Connection | None:
+    """What a request came over; None with another server than ours."""
+    found: Connection | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("connection")
+    return found
+
+
+def allow_files() -> None:
+    """Have this process allowed `FILES` files, or as many as it can."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if most > soft:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+def files_allowed() -> int:
+    """How many files this process may open."""
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+
+def share() -> float:
+    """How many of all places this process has descriptors for."""
+    return min(1.0, files_allowed() / 2 / (HALL + LIMITS["connections"].all))
+
+
+def protocol(places: Places) -> type[Connection]:
+    """`Connection` in a hall of its own, with as many places as there are descriptors for."""
+    hall = Hall(places, max(1, int(share() * HALL)))
+    return type("Connection", (Connection,), {"hall": hall})
+
+
+def limits(places: Places) -> dict[str, Any]:
     """What uvicorn is to be configured with."""
     return {
-        "http": protocol(),
-        "backlog": ACCEPTED,
+        "http": protocol(places),
         "ws": "none",
         "proxy_headers": False,  # else a client on this machine writes its own address itself
         "timeout_keep_alive": int(HEADER_S),

@@ -11,22 +11,28 @@ import re
 import tarfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from anyio import CapacityLimiter, to_thread
 from fastapi.responses import Response
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from stage_service.api.connections import connection_of
+from stage_service.api.entrance import no_place, owner_of
+from stage_service.api.pace import Turn
+from stage_service.api.places import NoPlace, Places
 from stage_service.api.problems import problem_response
 from stage_service.storage import InUse
 from stage_service.web.headers import attachment
 
-CHUNK = 1 << 20
-READERS = 8
-"""Downloads that read the disk at the same time."""
+CHUNK = 256 << 10
+"""Bytes that are read at a time; an answer of no more is no download that counts."""
+READERS, OTHER_READERS = 8, 2
+"""Downloads that read the disk at the same time: of callers who may steer, and of the others."""
 Read = Callable[[int, int], bytes]
 """The bytes from one place to (not with) another, or fewer of them."""
 RANGES: dict[int | str, dict[str, Any]] = {
@@ -39,9 +45,17 @@ RANGES: dict[int | str, dict[str, Any]] = {
 class Ranged(Response):
     """`size` bytes, as `read` gives them, or the range that is asked for."""
 
-    def __init__(self, size: int, read: Read, etag: str, media_type: str, name: str = "") -> None:
+    def __init__(
+        self,
+        size: int,
+        read: Read,
+        etag: str,
+        media_type: str,
+        name: str = "",
+        close: Callable[[], object] = lambda: None,
+    ) -> None:
         super().__init__(media_type=media_type)
-        self._size, self._read = size, read
+        self._size, self._read, self._close = size, read, close
         del self.headers["content-length"]
         self.headers["etag"] = f'"{etag}"'
         self.headers["accept-ranges"] = "bytes"
@@ -49,7 +63,15 @@ class Ranged(Response):
             self.headers["content-disposition"] = attachment(name)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 200, 206, 304 or 416."""
+        """Answer 200, 206, 304, 416, and 429 or 503 where the caller has no place for it."""
+        try:
+            await self._answer(scope, receive, send)
+        except NoPlace as error:
+            await no_place(scope, error)(scope, receive, send)
+        finally:
+            self._close()
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         asked, etag = Headers(scope=scope), self.headers["etag"]
         known = [
             tag.strip().removeprefix("W/") for tag in asked.get("if-none-match", "").split(",")
@@ -69,14 +91,28 @@ class Ranged(Response):
             self.headers["content-range"] = f"bytes {first}-{last - 1}/{self._size}"
         if self.status_code != 304:
             self.headers["content-length"] = str(last - first)
-        headers = {"status": self.status_code, "headers": self.raw_headers}
-        await send({"type": "http.response.start", **headers})
-        while first < last:
+        start = {"type": "http.response.start", "status": self.status_code}
+        places: Places = scope["app"].state.places
+        large = last - first > CHUNK
+        with places.holding("downloads", owner_of(scope)) if large else nullcontext():
+            await send({**start, "headers": self.raw_headers})
+            await self._send(first, last, scope, send)
+
+    async def _send(self, first: int, last: int, scope: Scope, send: Send) -> None:
+        """Send the bytes, of a large answer to somebody who may not steer each part in its turn,
+        until the client has gone."""
+        connection, pace, steers = connection_of(scope), scope["app"].state.pace, _steers(scope)
+        more = False
+        while first < last and not (connection is not None and connection.gone):
+            turn = await pace.turn(None) if more and not steers else Turn()
             stop = min(first + CHUNK, last)
-            data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))
+            try:
+                data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))
+            finally:
+                turn.end()
             if not data:
                 raise OSError(f"{scope['path']}: the file has become shorter")
-            first += len(data)
+            first, more = first + len(data), True
             await send({"type": "http.response.body", "body": data, "more_body": True})
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
@@ -96,14 +132,22 @@ class Ranged(Response):
 def file_response(file: Path, media_type: str) -> Ranged:
     """A file. Raises `InUse` where it has just gone."""
     found = _stat(file)
-    etag = f"{found.st_mtime_ns:x}-{found.st_size:x}-{found.st_ino:x}"
-    return Ranged(found.st_size, _reader(file), etag, media_type)
+    return Ranged(found.st_size, _reader(file), _etag(found), media_type)
 
 
-def bytes_response(data: bytes, media_type: str, name: str) -> Ranged:
-    """Bytes that are at hand, to be saved as `name`."""
-    etag = hashlib.sha256(data).hexdigest()
-    return Ranged(len(data), lambda first, last: data[first:last], etag, media_type, name)
+def opened_response(file: BinaryIO, media_type: str, name: str) -> Ranged:
+    """A file that is open, as `name`: whole, whatever becomes of its own name. It is closed after
+    the answer."""
+    number = file.fileno()
+    found = os.fstat(number)
+    return Ranged(
+        found.st_size,
+        lambda first, last: os.pread(number, last - first, first),
+        _etag(found),
+        media_type,
+        name,
+        file.close,
+    )
 
 
 def tar_response(name: str, files: Mapping[str, Path]) -> Ranged:
@@ -151,6 +195,10 @@ class _Tar:
             first, part = stop, part + 1
 
 
+def _etag(found: os.stat_result) -> str:
+    return f"{found.st_mtime_ns:x}-{found.st_size:x}-{found.st_ino:x}"
+
+
 def _fixed(data: bytes) -> Read:
     return lambda first, last: data[first:last]
 
@@ -176,11 +224,15 @@ def _reader(file: Path) -> Read:
     return read
 
 
+def _steers(scope: Scope) -> bool:
+    return owner_of(scope).steers
+
+
 def _readers(scope: Scope) -> CapacityLimiter:
     state = scope["app"].state
     if not hasattr(state, "readers"):
-        state.readers = CapacityLimiter(READERS)
-    limiter: CapacityLimiter = state.readers
+        state.readers = {True: CapacityLimiter(READERS), False: CapacityLimiter(OTHER_READERS)}
+    limiter: CapacityLimiter = state.readers[_steers(scope)]
     return limiter
 
 

@@ -1,20 +1,17 @@
-"""What a request passes before a route sees it: whom it is for, who sent it, how large it is.
+"""What a request passes before a route sees it: whom it is for, and who sent it.
 
 All of it on the event loop, so that a blackout waits for no thread here.
 """
 
 from __future__ import annotations
 
-import asyncio
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from reconstruction.reading import parse_json
+from stage_service.api.entrance import answer
 from stage_service.api.login import cookies, place
 from stage_service.api.problems import problem_response
 from stage_service.api.scopes import Route, route_of
@@ -31,13 +28,6 @@ DARK = ("POST", "/devices/blackout")
 """The one request that a page's right to a blackout opens."""
 NAMES = {"/devices/blackout": "blackout", "/login": "login"}
 """What the audit log calls them, refused or not."""
-MOST_BODY = 1 << 20
-BODY_S = 20.0
-"""A request's body is there within this time."""
-LINGER_S = 10.0
-"""How long a request that is refused may go on sending."""
-UPLOADS, MOST_UPLOAD, UPLOAD_S = ("/uploads/", f"{VIEW}/models/"), 32 << 20, 120.0
-"""Where a `PUT` may be larger, and take longer: two at a time, each of them in memory."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +81,11 @@ class Access:
 
 
 class Gate:
-    """Passes on what `access` lets in, with its body read; the caller is `identity` in the scope's
-    state. All else is answered with a problem document."""
+    """Passes on what `access` lets in; the caller is `identity` in the scope's state. All else is
+    answered with a problem document."""
 
     def __init__(self, app: ASGIApp, access: Access, refusals: Refusals | None = None) -> None:
         self._app, self._access, self._refusals = app, access, refusals
-        self._uploads = asyncio.Semaphore(2)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
@@ -108,13 +97,8 @@ class Gate:
         darkens = route is not None and (route.method, route.path) == DARK
         state = scope.setdefault("state", {})
         refusal = self._access.refusal(headers) or self._scope_refusal(scope, route, darkens)
-        if refusal is None and darkens:  # which has no body, and waits for none
-            await self._app(scope, receive, send)
-        elif refusal is None:
-            upload = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
-            async with self._uploads if upload else nullcontext():
-                refusal = await self._with_body(scope, receive, send, upload)
         if refusal is None:
+            await self._app(scope, receive, send)
             if found := state.get("refusal"):
                 self._record(scope, route, *found)
             return
@@ -125,10 +109,9 @@ class Gate:
             detail = f"{why}. The stage was NOT darkened: press the wired emergency stop."
         more = {"scope": route.scopes[0]} if slug == "forbidden" and route and route.scopes else {}
         response = problem_response(scope["path"], slug, detail, status=status, **more)
-        response.headers["connection"] = "close"
         if slug == "unauthorized":
             response.headers["www-authenticate"] = "Bearer"
-        await response(scope, receive, _lingering(headers, receive, send))
+        await answer(response, scope, receive, send)
 
     def _scope_refusal(
         self, scope: Scope, route: Route | None, darkens: bool
@@ -166,92 +149,6 @@ class Gate:
             slug,
             detail,
         )
-
-    async def _with_body(
-        self, scope: Scope, receive: Receive, send: Send, upload: bool
-    ) -> tuple[str, str, int | None] | None:
-        """Read the body and pass the request on; returns why that was not done."""
-        headers = Headers(scope=scope)
-        most, within_s = (MOST_UPLOAD, UPLOAD_S) if upload else (MOST_BODY, BODY_S)
-        try:
-            async with asyncio.timeout(within_s):
-                body = await _body(headers, receive, most)
-        except TimeoutError:
-            return "http", f"the request was not there within {within_s:g} s", 408
-        except OverflowError:
-            return "too-large", f"a request has at most {most:,} bytes", None
-        wrong = None if upload else _not_json(headers, body)
-        if wrong is None:
-            await self._app(scope, _again(body, receive), send)
-        else:
-            told = [{"loc": "", "msg": wrong}]
-            answer = problem_response(scope["path"], "invalid-request", wrong, errors=told)
-            await answer(scope, receive, send)
-        return None
-
-
-async def _body(headers: Headers, receive: Receive, most: int) -> Message:
-    """The whole body as one message. Raises `OverflowError`; a client that has gone is one, too."""
-    length = headers.get("content-length", "")
-    if length.isdigit() and int(length) > most:
-        raise OverflowError
-    body = bytearray()
-    while True:
-        message = await receive()
-        if message["type"] != "http.request":
-            return message
-        body += message.get("body", b"")
-        if len(body) > most:
-            raise OverflowError
-        if not message.get("more_body", False):
-            return {"type": "http.request", "body": bytes(body), "more_body": False}
-
-
-def _lingering(headers: Headers, receive: Receive, send: Send) -> Send:
-    """Sends an answer, then takes and forgets what the client still sends before the last word.
-
-    A connection that is closed with unread bytes is reset, and the answer is lost with it.
-    """
-
-    async def rest() -> None:
-        while True:
-            message = await receive()
-            if message["type"] != "http.request" or not message.get("more_body", False):
-                return
-
-    async def send_then_wait(message: Message) -> None:
-        last = message["type"] == "http.response.body" and not message.get("more_body", False)
-        if last and "expect" not in headers:  # who expects to be asked sends nothing yet
-            await send({**message, "more_body": True})
-            with suppress(TimeoutError):
-                async with asyncio.timeout(LINGER_S):
-                    await rest()
-            message = {"type": "http.response.body", "body": b""}
-        await send(message)
-
-    return send_then_wait
-
-
-def _not_json(headers: Headers, message: Message) -> str | None:
-    """Why a body that calls itself JSON, or nothing at all, cannot be read as such."""
-    kind = headers.get("content-type", "json").partition(";")[0].strip().lower()
-    if not message.get("body") or not kind.endswith("json"):
-        return None
-    try:
-        parse_json(message["body"])
-    except ValueError as error:
-        return f"the body is not JSON: {error}"
-    return None
-
-
-def _again(message: Message, receive: Receive) -> Receive:
-    """Gives the message that was read already, then what comes."""
-    waiting: list[Any] = [message]
-
-    async def next_message() -> Message:
-        return waiting.pop() if waiting else await receive()
-
-    return next_message
 
 
 def _name(host: str) -> str:

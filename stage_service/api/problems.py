@@ -46,11 +46,13 @@ from stage_service.records.lease import Leased, NoLease
 from stage_service.records.tokens import UnknownToken
 from stage_service.storage import BadUpload, InUse, NotRemoved, NotThere
 from stage_service.submitting import KeyUsed, ModelInUse, NotFinished, UnknownArtifact
-from stage_service.viewer import BadLight, NothingToView
+from stage_service.viewer import BadLight, NothingToView, TracerStopped
 from stage_service.watching import NotReady
 
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
+MOST_ERRORS = 20
+"""Fields that an answer lists: a list of 60,000 wrong ones would take seconds to tell."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,12 @@ foreign-origin 403 A web page of another site asked
 too-many-logins 429 Wait before you log in again
     Too many wrong tokens came from this address. `Retry-After` has the seconds. No other address
     waits for that, no token that is sent with each request, and no blackout.
+no-place 429 The caller has as many as they may have
+    Connections, event streams, uploads, downloads, renders and requests at work are counted by
+    token, and some are kept for tokens with the scope `steer`. `detail` says which limit it is,
+    how many the token has, and what to do; the header `Retry-After` says when to try again. With
+    the status 503 others have what there is, or a capture is being shot. Abort and blackout are
+    answered all the same.
 too-large 413 The request is too large
     `detail` says what is allowed.
 invalid-request 422 The request does not fit the schema
@@ -222,6 +230,7 @@ BY_ERROR: dict[type[Exception], str] = {
     KeyUsed: "key-used",
     ModelInUse: "model-in-use",
     JobsUnavailable: "jobs-unavailable",
+    TracerStopped: "no-place",
     UnknownCapture: "unknown-capture",
     UnknownFrame: "unknown-frame",
     MissingFrame: "missing-frame",
@@ -332,20 +341,24 @@ def install_problems(app: FastAPI) -> None:
     async def known(request: Request, error: Exception) -> Response:
         slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))
         extra = {k: getattr(error, k) for k in EXTRA if hasattr(error, k)}
-        response = problem_response(request.url.path, slug, str(error), **extra)
+        status = error.status if isinstance(error, TracerStopped) else None
+        response = problem_response(request.url.path, slug, str(error), status=status, **extra)
         if slug in WHO_MAY:
             request.state.refusal = slug, str(error)
-        if isinstance(error, TooManyLogins):
+        if isinstance(error, TooManyLogins | TracerStopped):
             response.headers["retry-after"] = str(error.retry_after)
         return response
 
     async def invalid(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
+        found = error.errors()
         errors = [
             {"loc": ".".join(str(p) for p in e["loc"] if p != "body"), "msg": e["msg"]}
-            for e in error.errors()
+            for e in found[:MOST_ERRORS]
         ]
         detail = "; ".join(f"{e['loc']}: {e['msg']}" for e in errors)
+        if len(found) > MOST_ERRORS:
+            detail += f"; and {len(found) - MOST_ERRORS} more"
         return problem_response(request.url.path, "invalid-request", detail, errors=errors)
 
     async def http(request: Request, error: Exception) -> Response:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
@@ -11,7 +10,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from starlette.concurrency import run_in_threadpool
 
 from stage_service.acquisition.states import Outcome
-from stage_service.api.downloads import RANGES, bytes_response, file_response
+from stage_service.api.downloads import RANGES, file_response, opened_response
 from stage_service.api.lanes import OnLanes
 from stage_service.api.steering import READS, Anybody, OnService, Processes, Steers
 from stage_service.frames import FrameFigures
@@ -117,8 +116,8 @@ async def abort_capture(
 )
 def get_frame(capture: str, step: int, camera: str, service: OnService) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
-    data = service.frame(capture, step, camera, Path.read_bytes)
-    return bytes_response(data, "image/x-exr", f"{capture}-{step}-{camera}.exr")
+    file = service.frame(capture, step, camera, lambda path: path.open("rb"))
+    return opened_response(file, "image/x-exr", f"{capture}-{step}-{camera}.exr")
 
 
 @reading.get(

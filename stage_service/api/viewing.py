@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import mimetypes
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response, Security
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from reconstruction import Camera
-from reconstruction.arrays import Array
+from reconstruction import Light as Lamp
 from stage_service.api.downloads import file_response
+from stage_service.api.entrance import owner_of
 from stage_service.api.gate import VIEW, VIEW_PAGE
 from stage_service.api.steering import READS, caller
-from stage_service.viewer import BadLight, NothingToView, Viewed, Viewing
+from stage_service.viewer import BadLight, Viewing
 from stage_service.viewer.viewed import MOST_PIXELS
 from stage_service.web.headers import PAGE
 
@@ -58,15 +58,11 @@ class View(BaseModel):
     R: Matrix
     t: Vector
 
-    def camera(self) -> Camera:
-        """Raises `BadLight` where it cannot be one."""
+    def checked(self) -> dict[str, Any]:
+        """Its fields. Raises `BadLight` where it has too many pixels."""
         if self.width * self.height > MOST_PIXELS:
             raise BadLight(f"a view may have {MOST_PIXELS} pixels, not {self.width * self.height}")
-        try:
-            lens, turned, moved = (np.array(x) for x in (self.K, self.R, self.t))
-            return Camera("view", self.width, self.height, lens, turned, moved)
-        except ValueError as error:
-            raise BadLight(str(error)) from error
+        return self.model_dump()
 
 
 class LightInView(Light):
@@ -89,12 +85,29 @@ async def on_viewing(request: Request) -> Viewing:
 OnViewing = Annotated[Viewing, Depends(on_viewing)]
 
 
-def viewed_model(name: str, viewing: OnViewing) -> Viewed:
-    """The model that a route is about; raises `LookupError` where there is none."""
-    return viewing.get(name)
+@dataclass(frozen=True)
+class _Model:
+    """The model that a route is about, for one caller."""
+
+    name: str
+    viewing: Viewing
+    yields: bool
+
+    def do(self, operation: str, **options: Any) -> Any:
+        """As `Viewing.do`."""
+        return self.viewing.do(self.name, operation, yields=self.yields, **options)
+
+    def bytes(self, operation: str, **options: Any) -> Response:
+        """The same as an answer."""
+        return Response(self.do(operation, **options), media_type="application/octet-stream")
 
 
-OnModel = Annotated[Viewed, Depends(viewed_model)]
+async def viewed_model(name: str, request: Request, viewing: OnViewing) -> _Model:
+    """The model that a route is about."""
+    return _Model(name, viewing, not owner_of(request.scope).steers)
+
+
+OnModel = Annotated[_Model, Depends(viewed_model)]
 
 
 @page.get(VIEW)
@@ -117,10 +130,6 @@ def _file(name: str) -> Response:
     return response
 
 
-def _bytes(data: bytes) -> Response:
-    return Response(data, media_type="application/octet-stream")
-
-
 @reading.get("")
 def list_viewed(viewing: OnViewing) -> list[str]:
     """The models that can be looked at."""
@@ -130,7 +139,8 @@ def list_viewed(viewing: OnViewing) -> list[str]:
 @reading.get("/{name}")
 def get_about(model: OnModel) -> dict[str, Any]:
     """What there is of a model: its sets of strands, head, cameras, lights, material."""
-    return model.about()
+    about: dict[str, Any] = model.do("about")
+    return about
 
 
 @reading.get("/{name}/strands/{which}", **BYTES)
@@ -142,45 +152,45 @@ def get_strands(
 ) -> Response:
     """Some strands, any beginning of which is spread over all: points (uint16, `low + step * p`),
     then lengths and radii (float32, metres), little-endian."""
-    return _bytes(model.packed(which).chunk(first, count))
+    return model.bytes("strands", which=which, first=first, count=count)
 
 
 @reading.get("/{name}/head", **BYTES)
 def get_head(model: OnModel) -> Response:
     """The head: two numbers (uint32), vertices (float32), faces (uint32), little-endian."""
-    return _bytes(model.head_bytes())
+    return model.bytes("head")
 
 
 @reading.get("/{name}/confidence", **BYTES)
 def get_confidence(model: OnModel) -> Response:
     """How near a measured point each point of the strands is: 255 at it, 0 at 5 mm and beyond."""
-    return _bytes(model.confidence())
+    return model.bytes("confidence")
 
 
 @reading.get("/{name}/lighting")
 def get_lighting(model: OnModel) -> dict[str, Any]:
     """The lights by number, and the hair's material if one was fitted."""
-    return model.lighting.about()
+    lighting: dict[str, Any] = model.do("lighting")
+    return lighting
 
 
 @reading.get("/{name}/table", **BYTES)
 def get_table(model: OnModel) -> Response:
     """The azimuthal part of the hair's four lobes, by the eye's inclination and the turn."""
-    return _bytes(model.lighting.table())
+    return model.bytes("table")
 
 
 @reading.get("/{name}/seen/{light}", **BYTES)
 def get_seen(model: OnModel, light: int) -> Response:
     """Where a light reaches: 255 or 0 for each point of the strands, then of the head."""
-    if not 0 <= light < len(model.lighting.lights):
-        raise NothingToView(f"there is no light number {light}")
-    return _bytes(model.lighting.seen(light))
+    return model.bytes("seen", light=light)
 
 
 @reading.post("/{name}/few")
 def get_few(model: OnModel, body: Light) -> list[dict[str, Any]]:
     """The few lights that stand for all of these in the shader."""
-    return model.lighting.few(dict(body.weights))
+    few: list[dict[str, Any]] = model.do("few", weights=_named(body))
+    return few
 
 
 @reading.post("/{name}/indirect", **BYTES)
@@ -188,7 +198,7 @@ def post_indirect(model: OnModel, body: Light) -> Response:
     """Light between fibres under these lights: of each cell of the box of the strands, x fastest, 9
     coefficients (RGB, float32) of harmonics over the direction in which it leaves. Paths are traced
     when it is first asked for, which takes many seconds."""
-    return _bytes(model.lighting.indirect(dict(body.weights)))
+    return model.bytes("indirect", weights=_named(body))
 
 
 @reading.post("/{name}/indirect/view", **BYTES)
@@ -196,15 +206,13 @@ def post_indirect_in_view(model: OnModel, body: LightInView) -> Response:
     """Light between fibres under these lights as one view sees it: of hair, then of the head, for
     each pixel its radiance (RGB) times the share that it covers, and that share, a fiftieth of both
     in pixels of the other; float32. Paths are traced for seconds."""
-    return _bytes(model.lighting.indirect_in_view(body.view.camera(), dict(body.weights)))
+    return model.bytes("indirect_in_view", view=body.view.checked(), weights=_named(body))
 
 
 @reading.post("/{name}/sums/{camera}.png", **PNG)
 def get_sum(model: OnModel, camera: str, body: Light) -> Response:
     """A camera's captured frames under these lights: their sum, exposed, in the sRGB curve."""
-    if camera not in {c["name"] for c in model.about()["cameras"]}:
-        raise NothingToView(f"there is no camera {camera!r}")
-    png = model.lighting.sum(camera, dict(body.weights), body.exposure)
+    png = model.do("sum", camera=camera, weights=_named(body), exposure=body.exposure)
     return Response(png, media_type="image/png")
 
 
@@ -213,7 +221,7 @@ def get_environment(
     model: OnModel, which: str, rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0
 ) -> dict[int, list[float]]:
     """By what each light is multiplied to stand for the map "studio" or "sky"."""
-    return _lit(model.lighting.environment(which, rotation_deg))
+    return _lit(model.do("environment", which=which, rotation_deg=rotation_deg))
 
 
 @router.put("/{name}/environments/{file}", openapi_extra=MAP)
@@ -231,12 +239,19 @@ async def put_environment(
         raise BadLight(f"an environment map must be .hdr or .exr, got {kind!r}")
 
     def work() -> dict[int, list[float]]:
-        lights = model.lighting.lights
-        return _lit(viewing.decoder.map_weights(data, file, kind, rotation_deg, lights))
+        found = enumerate(model.do("lights"))
+        lights = [Lamp(f"light_{n}", place, intensity) for n, (place, intensity) in found]
+        weights = viewing.decoder.map_weights(data, file, kind, rotation_deg, lights)
+        return _lit(weights.tolist())
 
     return await run_in_threadpool(work)
 
 
-def _lit(weights: Array) -> dict[int, list[float]]:
+def _lit(weights: list[list[float]]) -> dict[int, list[float]]:
     """The `weights (L, 3)` of the lights that have any, by their numbers."""
-    return {i: w.tolist() for i, w in enumerate(weights) if w.any()}
+    return {i: w for i, w in enumerate(weights) if any(w)}
+
+
+def _named(light: Light) -> dict[str, list[float]]:
+    """The weights by the lights' numbers, as JSON has them."""
+    return {str(number): list(weight) for number, weight in light.weights.items()}

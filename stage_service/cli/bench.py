@@ -17,6 +17,7 @@ BENCHMARKS = {
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
     "backends": "BSDF, OLAT, stage 1 and line stereo on CPU and GPU: seconds, agreement",
     "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
+    "callers": "load x caller x fault: seconds to a blackout, how much slower a capture is",
     "captures": "10,000 captures in a root: the service's start, and a page of them",
     "console": "a capture and an idle service, beside three open pages, streams of events, nobody",
     "demo": "the demo over subjects and seeds beside its baselines, from runs that were made",

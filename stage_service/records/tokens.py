@@ -32,6 +32,10 @@ WAIT_S = 0.5
 """How long everybody waits for a disk that does not say whose a token is."""
 
 
+EVERY_S = 0.02
+"""How often the file is looked at: each look takes a thread, and many requests come within that."""
+
+
 class TokenError(ValueError):
     """A token that cannot be made or revoked, or a file of tokens that cannot be read."""
 
@@ -68,7 +72,9 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
+        self._file = WatchedFile[dict[str, Identity]](
+            path, self._opened, {}, wait_s=WAIT_S, every_s=EVERY_S
+        )
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""
@@ -133,6 +139,7 @@ class Tokens:
 
     def _write(self, entries: list[Entry]) -> None:
         write_secret(self._path, json.dumps([e.model_dump() for e in entries], indent=1) + "\n")
+        self._file.changed()
 
 
 def own_file() -> Path:

@@ -45,6 +45,11 @@ class WatchedFile(Generic[T]):
             return self._last[1]
         return look.result() if wait([look], left).done else self._last[1]
 
+    def changed(self) -> None:
+        """Have the next reader wait for the file: this process has just written it."""
+        with self._looking:
+            self._look, self._due = None, 0.0
+
     def _looked(self) -> T:
         version = version_of(self._path)
         if version != self._last[0]:

@@ -1,15 +1,40 @@
-"""Which models are looked at; the few that were last are kept in memory."""
+"""Which models are viewed, in this process; the few that were last are kept in memory."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from typing import Any
 
 from stage_service.decoding import Decoder
+from stage_service.viewer.operations import OPERATIONS, Source
+from stage_service.viewer.tracer import Tracer
 from stage_service.viewer.viewed import Viewed
 
 KEPT = 2
+
+
+class Kept:
+    """Models by whatever `open_model` reads them by (or raises `LookupError`)."""
+
+    def __init__(self, open_model: Callable[[Any], Viewed]) -> None:
+        self._open = open_model
+        self._kept: OrderedDict[Hashable, tuple[object, Viewed]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, name: Hashable) -> Viewed:
+        """The model of that name, read anew where its strands have changed."""
+        with self._lock:
+            found = self._kept.get(name)
+            if found is None or found[0] != _version(found[1]):
+                viewed = self._open(name)
+                found = _version(viewed), viewed
+                self._kept[name] = found
+            self._kept.move_to_end(name)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+            return found[1]
 
 
 class Viewing:
@@ -22,22 +47,35 @@ class Viewing:
         open_model: Callable[[str], Viewed],
         decoder: Decoder,
     ) -> None:
-        self.names, self._open, self.decoder = names, open_model, decoder
-        self._kept: OrderedDict[str, tuple[object, Viewed]] = OrderedDict()
-        self._lock = threading.Lock()
+        self.names, self.decoder = names, decoder
+        self._kept = Kept(open_model)
 
     def get(self, name: str) -> Viewed:
         """The model of that name, read anew where its strands have changed."""
-        with self._lock:
-            found = self._kept.get(name)
-            if found is None or found[0] != _version(found[1]):
-                viewed = self._open(name)
-                found = _version(viewed), viewed
-                self._kept[name] = found
-            self._kept.move_to_end(name)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-            return found[1]
+        return self._kept.get(name)
+
+    def do(self, name: str, operation: str, *, yields: bool = False, **options: Any) -> Any:
+        """What one of `OPERATIONS` makes of a model: bytes, or JSON-ready. With `yields` it may be
+        stopped for a capture. Raises `LookupError`, `BadLight`, `ModelError`, `CaptureError`."""
+        return OPERATIONS[operation](self.get(name), **options)
+
+
+class RemoteViewing(Viewing):
+    """The same, in the process of a `tracer`; `find` says where a model lies."""
+
+    def __init__(
+        self,
+        names: Callable[[], list[str]],
+        find: Callable[[str], Source],
+        decoder: Decoder,
+        tracer: Tracer,
+    ) -> None:
+        super().__init__(names, lambda name: find(name).open(), decoder)
+        self._find, self._tracer = find, tracer
+
+    def do(self, name: str, operation: str, *, yields: bool = False, **options: Any) -> Any:
+        """As `Viewing.do`; raises `TracerStopped` besides."""
+        return self._tracer.do(self._find(name), operation, options, yields=yields)
 
 
 def _version(viewed: Viewed) -> object:

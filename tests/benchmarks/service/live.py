@@ -20,6 +20,8 @@ from stage_service.cli.support.children import Children, own_command
 from stage_service.config import RigFile
 from stage_service.records.tokens import own_token
 
+FLAT = "benchmarks.service.flat_stage"
+"""The module that is a stage without a renderer."""
 HURRY_S = 300.0
 """Whatever a service is to come to, it has by then, on a busy machine too."""
 
@@ -100,7 +102,7 @@ class Live:
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 words = (process / "cmdline").read_bytes().split(b"\0")
-                if b"simulators" in words and rig in words:
+                if rig in words and not {b"simulators", FLAT.encode()}.isdisjoint(words):
                     return int(process.name)
         raise LookupError(f"no simulators of {self.rig.path} run here")
 

@@ -22,7 +22,8 @@ import uvicorn
 from waiting import until
 
 from stage_service.api import connections
-from stage_service.api.connections import Connection, limits, listening, protocol
+from stage_service.api.connections import HALL, limits, listening, share
+from stage_service.api.places import LIMITS, Places
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 SLOW = b"POST /slow HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\nx"
@@ -31,8 +32,8 @@ HALF = b"GET / HTTP/1.1\r\nHost: x\r\nX: "
 
 @pytest.fixture
 def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], socket.socket]]:
-    """`connect(data)`: a connection to a server with three places, over which `data` was sent."""
-    monkeypatch.setattr(Connection, "most", 3)
+    """`connect(data)`: a connection to a server whose hall has three places, over which `data` was
+    sent."""
 
     async def app(scope, receive, send):
         while scope["path"] == "/slow" and (await receive()).get("more_body"):
@@ -42,7 +43,8 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], socke
             pass
         await send({"type": "http.response.body", "body": b"hello"})
 
-    options = {**limits(), "http": Connection}
+    monkeypatch.setattr(connections, "HALL", 3)
+    options = limits(Places())
     server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off", **options))
     listener = listening()
     thread = threading.Thread(target=server.run, args=([listener],))
@@ -100,10 +102,12 @@ def test_headers_have_a_size(connect):
 
 
 def test_connections_leave_descriptors_for_a_capture(monkeypatch):
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (100, 4096))
-    assert protocol().most == 50
+    most = HALL + LIMITS["connections"].all
+    assert most == 512  # half of what `select` can watch
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, 1 << 20))
-    assert protocol().most == connections.MOST_CONNECTIONS < 1024  # what `select` knows
+    assert share() == 1
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 256))
+    assert share() * most == 128
 
 
 def test_a_unix_socket_is_for_user_and_group(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import dataclasses
 import json
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -15,7 +16,7 @@ import pytest
 from serving import URL, refused, send, serving
 
 from reconstruction import Model
-from stage_service.api import event_stream, gate
+from stage_service.api import bodies, places
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
@@ -199,18 +200,19 @@ def test_a_page_of_another_site_asks_in_vain(service, origin):
 
 
 def test_listeners_leave_places_for_requests(ask, tokens, monkeypatch):
-    monkeypatch.setattr(event_stream, "MOST_STREAMS", 0)
-    assert "already" in refused(ask("GET /events", "mine"), "http", 503)["detail"]
+    none = dataclasses.replace(places.LIMITS["streams"], all=0)
+    monkeypatch.setitem(places.LIMITS, "streams", none)
+    assert "event streams" in refused(ask("GET /events", "mine"), "no-place", 503)["detail"]
 
 
 def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
     token = tokens.make("ada", SCOPES)
 
     async def long() -> AsyncIterator[bytes]:
-        for _ in range(gate.MOST_BODY // 1000 + 1):
+        for _ in range(bodies.MOST_BODY // 1000 + 1):
             yield b"a" * 1000
 
-    for content in (long(), b"a" * (gate.MOST_BODY + 1)):
+    for content in (long(), b"a" * (bodies.MOST_BODY + 1)):
         refused(ask("POST /captures", token, content=content), "too-large", 413)
     names = [f"x{i}" for i in range(4097)]
     for plan in ({"lights": names}, {"projectors": names}, {"lights": ["x" * 101]}):

@@ -23,6 +23,7 @@ from waiting import until
 from reconstruction import CaptureWriter, Step
 from stage_service import watching
 from stage_service.api.gate import Access
+from stage_service.api.places import LIMITS
 from stage_service.captures import control, status_index
 from stage_service.captures import manager as manager_module
 from stage_service.captures.catalogue import Catalogue
@@ -31,7 +32,7 @@ from stage_service.jobs.slots import WorkerSlot
 from stage_service.records.tokens import Tokens
 
 THREADS = 45
-"""More than the 40 that the framework has for all routes that do not say otherwise."""
+"""More than may be at work at once, and more than the 40 that the framework has."""
 LONG = {"plan": {"projectors": []}}
 SHORT = {"plan": {"lights": ["light_003"], "projectors": []}}
 
@@ -83,14 +84,14 @@ def assert_it_can_be_darkened(http: Client, world: Any, capture: str | None) -> 
     assert (answer["state"], world.lit, world.show) == ("dark", set(), "OFF")
 
 
-def test_while_every_thread_of_the_framework_waits(rig_file, world, tmp_path, monkeypatch):
+def test_while_every_request_that_may_be_at_work_waits(rig_file, world, tmp_path, monkeypatch):
     with (
         serving(rig_file, tmp_path) as http,
         stuck(monkeypatch, http.service, "validate") as waiting,
     ):
         capture = begun(http, world)
         flood(http, "POST", "/plans:validate", json={})
-        until(lambda: waiting() == 40)
+        until(lambda: waiting() == LIMITS["requests"].steering)
         assert_it_can_be_darkened(http, world, capture)
 
 
@@ -160,7 +161,7 @@ def test_devices_that_hang_keep_nobody_waiting_who_asked_for_darkness(
             for _ in range(3 * control.MOST_BLACKOUTS):
                 answer = http.post("/devices/blackout").json()
                 assert (answer["safe"], answer["state"]) == (False, "unknown, unsafe")
-                assert "tried on" in answer["detail"]
+                assert "goes on" in answer["detail"]
             assert 0 < waiting() <= control.MOST_BLACKOUTS
             assert http.get("/health").json()["lamps"] == "unknown, unsafe"
         until(lambda: http.get("/health").json()["lamps"] == "dark")

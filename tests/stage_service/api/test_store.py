@@ -21,7 +21,7 @@ from waiting import gone, orphan, until
 
 from reconstruction import Capture, Model, verify
 from stage_service.acquisition.states import CaptureStatus
-from stage_service.api import gate
+from stage_service.api import bodies
 from stage_service.api.gate import Access
 from stage_service.cli import main
 from stage_service.jobs.queue import NoSuchJob
@@ -367,7 +367,7 @@ def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
     assert slug(http.post("/captures", json={"upload": "bert"})) == "not-there"
     both = {"upload": "anna", "head": "/x.obj"}
     assert slug(http.post("/captures", json=both)) == "bad-input"
-    monkeypatch.setattr(gate, "MOST_UPLOAD", 3 << 20)
+    monkeypatch.setattr(bodies, "MOST_UPLOAD", 3 << 20)
     large = HEAD + b"# " + b"x" * (2 << 20)
     assert http.put("/uploads/anna/head.obj", content=large).status_code == 200
     assert slug(http.put("/uploads/anna/head.obj", content=2 * large)) == "too-large"
@@ -449,7 +449,7 @@ def test_what_a_kill_left_of_the_trash_is_listed_until_it_has_gone(http, monkeyp
 
 def test_a_refusal_reaches_a_client_that_sends_on(http):
     """What a connection was told is lost where it is closed before all was read."""
-    size = 4 * gate.MOST_BODY
+    size = 4 * bodies.MOST_BODY
     host, port = http.base_url.host, http.base_url.port
     head = f"POST /plans:validate HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: {size}\r\n\r\n"
     with socket.create_connection((host, port), timeout=60) as connection:

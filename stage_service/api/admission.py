@@ -1,0 +1,63 @@
+"""Which connections go in from the porch, by the head of their first request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from email.utils import formatdate
+from http import HTTPStatus
+
+from starlette.datastructures import Headers
+
+from stage_service.api.entrance import STOP
+from stage_service.api.gate import Access
+from stage_service.api.pace import Paced
+from stage_service.api.places import AGAIN_S, Owner, Places
+from stage_service.api.porch import Verdict
+from stage_service.api.problems import problem_response
+from stage_service.web.headers import INERT
+
+
+class Admission:
+    """Judges connections: those of callers who may steer go in at once, and those that darken; the
+    others in turn, while there are places for their owners. `running()` is the id of the capture
+    that is shot."""
+
+    def __init__(self, access: Access, places: Places, running: Callable[[], str | None]) -> None:
+        self._access, self._places, self._running = access, places, running
+
+    def judge(self, head: bytes, address: str) -> Verdict:
+        """What becomes of a connection that begins with `head`: nothing, where it is encrypted."""
+        asked, headers = _parsed(head)
+        stop = STOP.fullmatch(asked)
+        stops = stop is not None and stop[1] in (None, self._running())
+        identity = self._access.identity(headers)
+        if identity is None and stops:
+            identity = self._access.darkens(headers)
+        owner = Owner.of(identity, (address, 0))
+        return Verdict(
+            owner,
+            at_once=owner.steers or (stops and identity is not None),
+            may=lambda: self._places.lacks("connections", owner) is None,
+            refusal=lambda: self._refusal(owner, asked.partition(" ")[2]),
+        )
+
+    def _refusal(self, owner: Owner, path: str) -> bytes:
+        """A whole answer, 429 or 503."""
+        why = self._places.lacks("connections", owner) or Paced()
+        response = problem_response(path, "no-place", str(why), status=why.status)
+        more = {"retry-after": str(AGAIN_S), "connection": "close"}
+        response.headers.update({**INERT, **more})
+        response.headers["date"] = formatdate(usegmt=True)
+        status = f"HTTP/1.1 {why.status} {HTTPStatus(why.status).phrase}\r\n".encode()
+        lines = [name + b": " + value + b"\r\n" for name, value in response.raw_headers]
+        return b"".join([status, *lines, b"\r\n", bytes(response.body)])
+
+
+def _parsed(head: bytes) -> tuple[str, Headers]:
+    """Method and path of a request as `STOP` has them, and its headers. What cannot be read is
+    nobody's: the server says what is wrong with it."""
+    first, *lines = head.partition(b"\r\n\r\n")[0].split(b"\r\n")
+    words = first.decode("latin-1").split(" ")
+    pairs = (line.partition(b":") for line in lines)
+    headers = Headers(raw=[(name.lower(), value.strip()) for name, _, value in pairs])
+    return " ".join(words[:2]).partition("?")[0], headers

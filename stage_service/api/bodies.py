@@ -1,0 +1,136 @@
+"""Bodies of requests: how large they may be, how fast they come, and whether they are JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from typing import Any
+
+from starlette.datastructures import Headers
+from starlette.types import Message, Receive, Send
+
+from reconstruction.reading import parse_json
+
+MOST_BODY, MOST_OTHERS = 1 << 20, 128 << 10
+"""Bytes of a request; of one by a caller without `steer`, the largest of which has the weights of
+1,000 lights. 1 MB of JSON keeps the event loop for 10 ms and more."""
+BODY_S = 20.0
+"""A request's body is there within this time."""
+MOST_UPLOAD, UPLOAD_S = 32 << 20, 120.0
+"""Bytes of an upload, which is in memory, and the time within which it is there."""
+GRACE_S, FLOOR = 5.0, 8 << 10
+"""From then on so many bytes a second, on average, have come of a body: one that stands still holds
+its place no longer."""
+LINGER_S = 10.0
+"""How long a request that is refused may go on sending."""
+
+
+class TooSlow(Exception):
+    """A body did not come in time."""
+
+    def __init__(self, came: int, seconds: float) -> None:
+        super().__init__(
+            f"of the request's body {came:,} bytes had come after {seconds:.0f} s: expected "
+            f"{FLOOR:,} bytes a second at least; send it again, over a faster connection"
+        )
+
+
+class TooLarge(Exception):
+    """A body is larger than it may be."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(f"a request has at most {most:,} bytes")
+
+
+class Left(Exception):
+    """The client has gone."""
+
+
+async def read(
+    headers: Headers,
+    receive: Receive,
+    most: int,
+    within_s: float,
+    pause: Callable[[], Awaitable[object]],
+) -> bytes:
+    """The whole body, with a `pause` after each part but the last. Raises `TooLarge` beyond `most`
+    bytes, `TooSlow` where it has not come within `within_s` seconds, or hardly comes, and `Left`.
+    """
+    length = headers.get("content-length", "")
+    if length.isdigit() and int(length) > most:
+        raise TooLarge(most)
+    began, body = time.monotonic(), bytearray()
+    while True:
+        left = began + min(within_s, GRACE_S + len(body) / FLOOR) - time.monotonic()
+        try:
+            async with asyncio.timeout(left):
+                message = await receive()
+        except TimeoutError:
+            raise TooSlow(len(body), time.monotonic() - began) from None
+        if message["type"] != "http.request":
+            raise Left
+        body += message.get("body", b"")
+        if len(body) > most:
+            raise TooLarge(most)
+        if not message.get("more_body", False):
+            return bytes(body)
+        began += await _seconds(pause)
+
+
+async def _seconds(pause: Callable[[], Awaitable[object]]) -> float:
+    began = time.monotonic()
+    await pause()
+    return time.monotonic() - began
+
+
+def again(body: bytes, receive: Receive) -> Receive:
+    """Gives the body that was read already, then what comes."""
+    waiting: list[Any] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def next_message() -> Message:
+        return waiting.pop() if waiting else await receive()
+
+    return next_message
+
+
+def not_json(headers: Headers, body: bytes) -> str | None:
+    """Why a body that calls itself JSON, or nothing at all, cannot be read as such."""
+    kind = headers.get("content-type", "json").partition(";")[0].strip().lower()
+    if not body or not kind.endswith("json"):
+        return None
+    try:
+        parse_json(body)
+    except ValueError as error:
+        return f"the body is not JSON: {error}"
+    return None
+
+
+def lingering(
+    headers: Headers, receive: Receive, send: Send, pause: Callable[[], Awaitable[object]]
+) -> Send:
+    """Sends an answer, then takes and forgets what the client still sends before the last word,
+    with a `pause` after each part.
+
+    A connection that is closed with unread bytes is reset, and the answer is lost with it.
+    """
+
+    async def rest() -> None:
+        while True:
+            message = await receive()
+            if message["type"] != "http.request" or not message.get("more_body", False):
+                return
+            await pause()
+
+    async def send_then_wait(message: Message) -> None:
+        last = message["type"] == "http.response.body" and not message.get("more_body", False)
+        if last and "expect" not in headers:  # who expects to be asked sends nothing yet
+            await send({**message, "more_body": True})
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LINGER_S):
+                    await rest()
+            message = {"type": "http.response.body", "body": b""}
+        await send(message)
+
+    return send_then_wait

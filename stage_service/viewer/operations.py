@@ -1,0 +1,95 @@
+"""What is done with one model for the viewer, by name: the routes' side of `Viewed`.
+
+Options and results are JSON-ready, or bytes, so that another process may do it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reconstruction import Camera, Capture, CaptureError, Model
+from stage_service.viewer.viewed import BadLight, NothingToView, Viewed
+
+Weights = dict[str, list[float]]
+"""By a light's number, as JSON has it: what its red, green and blue are multiplied by."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model's folder, and those of captures, the first of which that can be read is its own."""
+
+    model: Path
+    captures: tuple[Path, ...] = ()
+
+    def open(self) -> Viewed:
+        """The model as it is viewed."""
+        model = Model(self.model)
+        for path in self.captures:
+            with suppress(CaptureError):
+                return Viewed(model, Capture(path))
+        return Viewed(model)
+
+
+def _strands(model: Viewed, which: str, first: int, count: int) -> bytes:
+    return model.packed(which).chunk(first, count)
+
+
+def _seen(model: Viewed, light: int) -> bytes:
+    if not 0 <= light < len(model.lighting.lights):
+        raise NothingToView(f"there is no light number {light}")
+    return model.lighting.seen(light)
+
+
+def _sum(model: Viewed, camera: str, weights: Weights, exposure: float) -> bytes:
+    if camera not in {c["name"] for c in model.about()["cameras"]}:
+        raise NothingToView(f"there is no camera {camera!r}")
+    return model.lighting.sum(camera, _numbered(weights), exposure)
+
+
+def _in_view(model: Viewed, view: dict[str, Any], weights: Weights) -> bytes:
+    try:
+        lens, turned, moved = (np.array(view[name]) for name in ("K", "R", "t"))
+        camera = Camera("view", view["width"], view["height"], lens, turned, moved)
+    except ValueError as error:
+        raise BadLight(str(error)) from error
+    return model.lighting.indirect_in_view(camera, _numbered(weights))
+
+
+def _environment(model: Viewed, which: str, rotation_deg: float) -> list[list[float]]:
+    found: list[list[float]] = model.lighting.environment(which, rotation_deg).tolist()
+    return found
+
+
+def _lights(model: Viewed) -> list[list[list[float]]]:
+    """Place and intensity towards the origin of each."""
+    origin = np.zeros(3)
+    return [
+        [x.position.tolist(), x.intensity_towards(origin).tolist()] for x in model.lighting.lights
+    ]
+
+
+def _numbered(weights: Weights) -> dict[int, list[float]]:
+    return {int(number): value for number, value in weights.items()}
+
+
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "about": Viewed.about,
+    "strands": _strands,
+    "head": Viewed.head_bytes,
+    "confidence": Viewed.confidence,
+    "lighting": lambda model: model.lighting.about(),
+    "lights": _lights,
+    "table": lambda model: model.lighting.table(),
+    "seen": _seen,
+    "few": lambda model, weights: model.lighting.few(_numbered(weights)),
+    "indirect": lambda model, weights: model.lighting.indirect(_numbered(weights)),
+    "indirect_in_view": _in_view,
+    "sum": _sum,
+    "environment": _environment,
+}

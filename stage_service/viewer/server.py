@@ -1,0 +1,57 @@
+"""The tracer's process: does what its calls name, each on a thread of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from stage_service.decoding import framing
+from stage_service.viewer.operations import OPERATIONS, Source
+from stage_service.viewer.tracer import KINDS
+from stage_service.viewer.viewing import Kept
+
+LOWEST = 19
+"""The lowest priority: what the capture leaves of the processor."""
+MOST_REQUEST = 1 << 20
+
+
+def main(control: socket.socket) -> None:
+    """Serve the calls that come over `control`, until that is closed."""
+    os.nice(LOWEST)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    with suppress(OSError):  # when memory runs out, this goes first
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    kept = Kept(Source.open)
+    control.send(b"ready")
+    while True:
+        message, fds, _, _ = socket.recv_fds(control, 16, 1)
+        if not message:
+            os._exit(0)  # at once: whoever closes it waits
+        for fd in fds:
+            threading.Thread(target=_serve, args=(socket.socket(fileno=fd), kept)).start()
+
+
+def _serve(connection: socket.socket, kept: Kept) -> None:
+    with connection, suppress(OSError, EOFError):
+        request, _ = framing.receive(connection, MOST_REQUEST)
+        source = Source(Path(request["model"]), tuple(map(Path, request["captures"])))
+        try:
+            found = OPERATIONS[request["operation"]](kept.get(source), **request["options"])
+        except Exception as error:
+            kind = next((k for k, e in KINDS.items() if isinstance(error, e)), "fault")
+            text = str(error) if kind in KINDS else f"{type(error).__name__}: {error}"
+            framing.send(connection, {"kind": kind, "error": text})
+            return
+        if isinstance(found, bytes):
+            framing.send(connection, {}, [found])
+        else:
+            framing.send(connection, {"result": found})
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=int(sys.argv[1])))
