@@ -15,7 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 from waiting import until
 
-from stage_service.api.app import create_app
+from stage_service.api.app import AnnouncingServer, create_app
 from stage_service.api.connections import limits
 from stage_service.api.gate import Access
 from stage_service.config import RigFile
@@ -29,6 +29,7 @@ class Client(httpx.Client):
     """Asks the application; `service` is behind it."""
 
     service: Service
+    app: FastAPI
 
     def go_on(self) -> httpx.Response:
         """Read why the queue is held, and say that it may go on."""
@@ -47,12 +48,13 @@ def serving(
 ) -> Iterator[Client]:
     """The application, started and closed as the server does; it has read what is on the disk."""
     service = Service(rig_file, root)
+    app = create_app(service, access)
     # The socket takes connections before the server does: the first answer comes when it is up.
     with (
-        listening_app(create_app(service, access), port) as url,
+        listening_app(app, port) as url,
         Client(base_url=url, timeout=60, trust_env=False) as client,
     ):
-        client.service = service
+        client.service, client.app = service, app
         client.get("/health")
         until(lambda: not (all_read and service.unread))
         yield client
@@ -64,7 +66,7 @@ def listening_app(app: FastAPI, port: int = 0) -> Iterator[str]:
     config = uvicorn.Config(
         app, log_level="critical", timeout_graceful_shutdown=1, **limits(app.state.places)
     )
-    server = uvicorn.Server(config)
+    server = AnnouncingServer(config, app, lambda: None)
     listener = socket.create_server(("127.0.0.1", port))
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()

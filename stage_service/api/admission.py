@@ -8,10 +8,11 @@ from http import HTTPStatus
 
 from starlette.datastructures import Headers
 
-from stage_service.api.entrance import STOP
+from stage_service.api.connections import Hall
+from stage_service.api.entrance import EXPRESS, STOP
 from stage_service.api.gate import Access
 from stage_service.api.pace import Paced
-from stage_service.api.places import AGAIN_S, Owner, Places
+from stage_service.api.places import AGAIN_S, Owner
 from stage_service.api.porch import Verdict
 from stage_service.api.problems import problem_response
 from stage_service.web.headers import INERT
@@ -19,11 +20,11 @@ from stage_service.web.headers import INERT
 
 class Admission:
     """Judges connections: those of callers who may steer go in at once, and those that darken; the
-    others in turn, while there are places for their owners. `running()` is the id of the capture
-    that is shot."""
+    others in turn, while there are places for their owners or they need none. `running()` is the id
+    of the capture that is shot."""
 
-    def __init__(self, access: Access, places: Places, running: Callable[[], str | None]) -> None:
-        self._access, self._places, self._running = access, places, running
+    def __init__(self, access: Access, hall: Hall, running: Callable[[], str | None]) -> None:
+        self._access, self._hall, self._running = access, hall, running
 
     def judge(self, head: bytes, address: str) -> Verdict:
         """What becomes of a connection that begins with `head`: nothing, where it is encrypted."""
@@ -34,16 +35,17 @@ class Admission:
         if identity is None and stops:
             identity = self._access.darkens(headers)
         owner = Owner.of(identity, (address, 0))
+        express = stops or EXPRESS.fullmatch(asked) is not None
         return Verdict(
             owner,
             at_once=owner.steers or (stops and identity is not None),
-            may=lambda: self._places.lacks("connections", owner) is None,
+            may=lambda: express or self._hall.lacks(owner) is None,
             refusal=lambda: self._refusal(owner, asked.partition(" ")[2]),
         )
 
     def _refusal(self, owner: Owner, path: str) -> bytes:
         """A whole answer, 429 or 503."""
-        why = self._places.lacks("connections", owner) or Paced()
+        why = self._hall.lacks(owner) or Paced()
         response = problem_response(path, "no-place", str(why), status=why.status)
         more = {"retry-after": str(AGAIN_S), "connection": "close"}
         response.headers.update({**INERT, **more})

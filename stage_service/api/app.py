@@ -34,6 +34,7 @@ from stage_service.api.connections import (
     HEADER_S,
     LOOPBACK,
     QUEUED,
+    Hall,
     allow_files,
     files_allowed,
     limits,
@@ -135,7 +136,7 @@ def _completed(
     return app
 
 
-class _Announcing(uvicorn.Server):
+class AnnouncingServer(uvicorn.Server):
     """Says when requests are answered; connections come to it over a porch. Once it is to stop,
     requests have `REQUESTS_S`, and it ends by `STOP_S` whatever hangs. A second signal leaves them
     no time."""
@@ -151,7 +152,8 @@ class _Announcing(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup([])
         state, encrypted = self._app.state, self.config.ssl is not None
-        admission = Admission(state.access, state.places, state.running)
+        hall: Hall = self.config.http_protocol_class.hall  # type: ignore[union-attr]
+        admission = Admission(state.access, hall, state.running)
         self._porch = Porch(
             admission.judge,
             self._admit,
@@ -214,7 +216,7 @@ class _Announcing(uvicorn.Server):
         return made
 
 
-class _Server(_Announcing):
+class _Server(AnnouncingServer):
     """Puts the lights off at the signal itself, and answers until everything has been closed:
     blackout and health, above all."""
 
@@ -274,7 +276,7 @@ def serve_viewer(
             timeout_graceful_shutdown=REQUESTS_S,
             **limits(app.state.places),
         )
-        _Announcing(config, app, lambda: ready(url)).run(sockets=[listener])
+        AnnouncingServer(config, app, lambda: ready(url)).run(sockets=[listener])
 
 
 def serve(

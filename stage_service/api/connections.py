@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import resource
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
@@ -58,14 +58,22 @@ class Hall:
         self._inside.add(connection)
         return len(self._inside) <= self._most or _drop_longest(self._inside - {connection})
 
+    def lacks(self, owner: Owner) -> NoPlace | None:
+        """Why a connection of this owner's would find no place now, not even that of another which
+        waits for its client."""
+        lacks = self._places.lacks("connections", owner)
+        return lacks if not any(c.idle for c in self._of(owner)) else None
+
+    def _of(self, owner: Owner) -> Iterator[Connection]:
+        return (c for c in self._owned if c.owner == owner)
+
     def own(self, connection: Connection, owner: Owner) -> None:
         """Give it a place of its owner's, if need be that of one that waits for its client. Raises
         `NoPlace`, and leaves it where it is."""
         try:
             self._places.take("connections", owner)
         except NoPlace:
-            others = self._owned - {connection}
-            if not _drop_longest(c for c in others if c.owner == owner and c.parked is None):
+            if not _drop_longest(c for c in self._of(owner) if c.idle and c is not connection):
                 raise
             self._places.take("connections", owner)
         self.leave(connection)
@@ -143,6 +151,11 @@ class Connection(H11Protocol):
         return self._between or self.cycle.more_body or self.parked is not None
 
     @property
+    def idle(self) -> bool:
+        """Whether it waits for its client."""
+        return self.waits and self.parked is None
+
+    @property
     def _between(self) -> bool:
         return self.cycle is None or self.cycle.response_complete
 
@@ -193,7 +206,7 @@ class Connection(H11Protocol):
 
 def _drop_longest(connections: Iterable[Connection]) -> bool:
     """Drop the one that has waited longest; whether any waits."""
-    waiting = (c for c in connections if c.waits)
+    waiting = [c for c in connections if c.waits]
     longest = min(waiting, key=lambda c: c.since, default=None)
     if longest is not None:
         longest.drop()
