@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import os
 import pty
+import select
+import socket
 import socketserver
 import struct
 import threading
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +63,14 @@ class World:
         self.deaf_lights = False  # the light bank takes requests and answers none
         self.late: list[str] = []  # serial requests answered together with the next one
         self.garbage = b""  # sent before the next serial reply
+        self.hold_pulses = False  # the trigger box fires, and does not answer until `Wires.flush`
+        self.put_on: Callable[[set[Any]], object] = lambda _lamps: None  # what lights up, at once
+
+    def light(self, lamps: set[int]) -> None:
+        """Exactly these lamps are on from now on."""
+        new, self.lit = lamps - self.lit, lamps
+        if new:
+            self.put_on(new)
 
     def signal(self) -> int:
         """Counts above black per 10 ms of exposure, telling the light that was on."""
@@ -138,9 +150,8 @@ class Lights(socketserver.BaseRequestHandler):
         if address in (1000, 1003):
             if not (value == 0 and world.stuck_lamps):
                 dark = value == 0 or address == 1003 or world.dead_lamps
-                world.lit = set() if dark else {value - 1}
-            if value == 65535:
-                world.lit = set(range(LAMPS))
+                every = value == 65535  # dead lamps are those that are lit alone
+                world.light(set(range(LAMPS)) if every else set() if dark else {value - 1})
         elif address == 1001:
             world.heartbeats += 1
         elif address == 1002:
@@ -220,6 +231,8 @@ def projectors(world: World, line: str) -> str:
         return "ERR 1 unknown command"
     if line.startswith("LINE") and line.split()[1] not in ("left", "right"):
         return "ERR 2 unknown projector"
+    if line != "OFF":
+        world.put_on({line})
     world.show = line
     return f"OK {line}"
 
@@ -232,12 +245,20 @@ class SerialPeer:
         tty.setraw(self.far)
         self.path = os.ttyname(self.far)
         self.world, self.answer = world, answer
+        self.wake, self.waker = os.pipe()
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
 
     def run(self) -> None:
         data, held = b"", b""
         while True:
+            ready, _, _ = select.select([self.master, self.wake], [], [])
+            if self.wake in ready:
+                if os.read(self.wake, 1) == CUT:
+                    return
+                os.write(self.master, held)
+                held = b""
+                continue
             try:
                 data += os.read(self.master, 1024)
             except OSError:
@@ -252,21 +273,85 @@ class SerialPeer:
                         self.world.late.remove(text)
                         held += reply
                         continue
+                    if self.world.hold_pulses and text.startswith("PULSE"):
+                        held += reply
+                        continue
                     garbage, self.world.garbage = self.world.garbage, b""
                 os.write(self.master, held + garbage + reply)
                 held = b""
 
-    def close(self) -> None:
-        # The reader leaves when the last far end is closed (EIO), not by closing under it.
-        os.close(self.far)
-        self.thread.join(5)
-        os.close(self.master)
+    def flush(self) -> None:
+        """Send the replies that were held back."""
+        os.write(self.waker, FLUSH)
+
+    def cut(self) -> None:
+        """From now on nothing that is sent arrives, and whoever reads finds the line hung up."""
+        if self.thread.is_alive():
+            os.write(self.waker, CUT)
+            self.thread.join()
+        for handle in (self.master, self.far, self.wake, self.waker):
+            os.close(handle)
+
+
+CUT, FLUSH = b"c", b"f"
 
 
 class Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
     allow_reuse_address = True
     block_on_close = False
+
+    def __init__(self, world: World, handler: type[socketserver.BaseRequestHandler]) -> None:
+        super().__init__(("127.0.0.1", 0), handler)
+        self.world = world
+        self.links: set[Any] = set()
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self.links.add(request)
+        super().process_request(request, client_address)
+
+    def close_request(self, request: Any) -> None:
+        self.links.discard(request)
+        super().close_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A link that was cut."""
+
+    def drop(self) -> None:
+        """End the connections that there are."""
+        for link in list(self.links):
+            with suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+
+    def cut(self) -> None:
+        """Take no more connections, and end those that there are."""
+        self.shutdown()
+        self.server_close()
+        self.drop()
+
+
+@dataclass(frozen=True)
+class Wires:
+    """The wires from a rig file to a world, which outlives them."""
+
+    rig_file: RigFile
+    servers: list[Server]
+    serial: list[SerialPeer]
+
+    def flush(self) -> None:
+        """Have the trigger box answer what it has held back."""
+        for peer in self.serial:
+            peer.flush()
+
+    def drop_lights(self) -> None:
+        """End the connections to the light bank; new ones are taken."""
+        self.servers[0].drop()
+
+    def cut(self) -> None:
+        """As where the process at this end is gone: nothing arrives any more."""
+        for each in (*self.servers, *self.serial):
+            each.cut()
 
 
 @pytest.fixture
@@ -276,27 +361,33 @@ def world() -> World:
 
 
 @pytest.fixture
-def rig_file(world: World, tmp_path: Path, slack: int) -> Iterator[RigFile]:
+def wire(tmp_path: Path, slack: int) -> Callable[..., Wires]:
+    """`wire(world, **timeouts)`: wires to a rig of 200 lamps, 3 small cameras and 2 projectors,
+    until they are cut; `timeouts` in seconds by device."""
+    numbers = count()
+
+    def made(world: World, **timeouts: float) -> Wires:
+        servers = [Server(world, handler) for handler in (Lights, Cameras)]
+        serial = [SerialPeer(world, answer) for answer in (trigger, projectors)]
+        path = tmp_path / f"rig{next(numbers) or ''}.toml"
+        ports, paths = [s.server_address[1] for s in servers], [s.path for s in serial]
+        path.write_text(RIG + devices(ports, paths, slack, **timeouts))
+        return Wires(load_rig_file(path), servers, serial)
+
+    return made
+
+
+@pytest.fixture
+def rig_file(world: World, wire: Callable[..., Wires]) -> Iterator[RigFile]:
     """A rig of 200 lamps, 3 small cameras and 2 projectors whose devices answer on real wires."""
-    servers = []
-    for handler in (Lights, Cameras):
-        server = Server(("127.0.0.1", 0), handler)
-        server.world = world  # type: ignore[attr-defined]
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        servers.append(server)
-    serial = [SerialPeer(world, answer) for answer in (trigger, projectors)]
-    path = tmp_path / "rig.toml"
-    ports, paths = [s.server_address[1] for s in servers], [s.path for s in serial]
-    path.write_text(RIG + devices(ports, paths, slack))
-    yield load_rig_file(path)
-    for server in servers:
-        server.shutdown()
-        server.server_close()
-    for peer in serial:
-        peer.close()
+    wires = wire(world)
+    yield wires.rig_file
+    wires.cut()
 
 
-def devices(ports: list[int], paths: list[str], slack: int) -> str:
+def devices(
+    ports: list[int], paths: list[str], slack: int, lights: float = 0.8, trigger: float = 0.3
+) -> str:
     return f"""
 [safety]
 living_subject = false
@@ -305,10 +396,10 @@ heartbeat_s = 0.05
 watchdog_s = {1.0 * slack:g}
 [devices.lights]
 port = {ports[0]}
-timeout_s = {0.8 * slack:g}
+timeout_s = {lights * slack:g}
 [devices.trigger]
 port = "{paths[0]}"
-timeout_s = {0.3 * slack:g}
+timeout_s = {trigger * slack:g}
 [devices.projectors]
 port = "{paths[1]}"
 timeout_s = {0.3 * slack:g}
