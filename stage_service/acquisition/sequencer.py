@@ -25,7 +25,6 @@ from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, IndexShift
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.permission import NotPermitted, Permission
-from stage_service.devices.standstill import Standstill
 from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
 
@@ -264,7 +263,7 @@ class Sequencer:
                 device.set_watchdog(devices.config.watchdog_s)
             every = devices.config.heartbeat_s
             beats = [stack.enter_context(Heartbeat(device, every)) for device in watched]
-            stack.enter_context(Standstill(devices.config.watchdog_s, self._permission.lapse))
+            stack.enter_context(self._permission.lapsing(devices.config.watchdog_s))
             self._exposing.dark()
             for run in self._runs:
                 todo = {s: w for s in run.steps if (w := self._wanted(s))}

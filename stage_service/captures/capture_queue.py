@@ -98,11 +98,10 @@ class CaptureQueue(Background):
         begin: Callable[[Entry], str],
         waits_for: Callable[[], str | None],
         hold: Hold,
-        clock: ClockWatch | None = None,
     ) -> None:
         super().__init__("capture-queue")
         self._path, self._events, self._hold = path, events, hold
-        self._clock = clock or ClockWatch()
+        self._clock = ClockWatch()
         self._begin, self._stage_waits_for = begin, waits_for
         self._beginning = threading.Lock()  # one at a time, by the thread or by a person
         self._writing = threading.Lock()

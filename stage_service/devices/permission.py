@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal, Self
 
+from stage_service.devices.standstill import Standstill
+
 State = Literal["not granted", "live", "suspended", "revoked"]
 
 
@@ -31,6 +33,7 @@ class Permission:
         self._why = "nobody has granted it"
         self._changing = threading.Lock()  # for moments
         self._lighting = threading.Lock()  # while a device is commanded to light something
+        self._standstill: Standstill | None = None
 
     @classmethod
     def granted(cls, what: str) -> Self:
@@ -74,9 +77,17 @@ class Permission:
             _thread.permission = before
 
     @contextmanager
+    def lapsing(self, limit_s: float) -> Iterator[None]:
+        """A context in which it lapses where this process stands still for longer."""
+        with Standstill(limit_s, self.lapse) as self._standstill:
+            yield
+
+    @contextmanager
     def lighting(self, doing: str) -> Iterator[None]:
         """A context for one command that may light something. Raises `NotPermitted`."""
         with self._lighting:
+            if (standstill := self._standstill) is not None:
+                standstill.check()
             if not self.live:
                 raise NotPermitted(f"{doing}: {self._what} may not light it: {self._why}")
             yield

@@ -14,7 +14,9 @@ class Standstill:
     seconds: it was stopped, starved, or the machine slept.
 
     Whatever was lit is dark by then, by the watchdogs of the devices, and whoever is at the stage
-    takes it to be off: nothing may go on by itself afterwards. The thread waits for no device.
+    takes it to be off: nothing may resume by itself afterwards. A thread of its own, which waits
+    for no device, looks four times within the limit; `check` is for whoever is about to light
+    something, and may be the first to run again.
     """
 
     def __init__(
@@ -24,10 +26,12 @@ class Standstill:
         clock: Callable[[], float] = boot_seconds,
     ) -> None:
         self._limit_s, self._found, self._clock = limit_s, found, clock
+        self._last = clock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="standstill", daemon=True)
 
     def __enter__(self) -> Self:
+        self._last = self._clock()
         self._thread.start()
         return self
 
@@ -35,10 +39,14 @@ class Standstill:
         self._stop.set()
         self._thread.join()
 
+    def check(self) -> None:
+        """Call `found` where the last look is too long ago."""
+        still = self._clock() - self._last
+        if still > self._limit_s:
+            limit = f"watchdog_s = {self._limit_s:g}"
+            self._found(f"the service stood still for {still:.3g} s, longer than {limit}")
+
     def _run(self) -> None:
-        last = self._clock()
         while not self._stop.wait(self._limit_s / 4):
-            last, before = self._clock(), last
-            if last - before > self._limit_s:
-                still = f"the service stood still for {last - before:.3g} s"
-                self._found(f"{still}, longer than watchdog_s = {self._limit_s:g}")
+            self.check()
+            self._last = self._clock()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 JUMP_S = 2.0
 """Seconds by which wall clock and monotonic clock may drift apart between two looks: a clock that
 is disciplined drifts by milliseconds, one that was set or slept through a suspend by more."""
+
+
+def wall_seconds() -> float:
+    """Seconds since 1970 by the machine's clock, which may be set."""
+    return time.time()
 
 
 def boot_seconds() -> float:
@@ -16,14 +20,9 @@ def boot_seconds() -> float:
 
 
 class ClockWatch:
-    """Compares the wall clock with the monotonic one, look by look; both in seconds."""
+    """Compares the wall clock with the monotonic one, look by look."""
 
-    def __init__(
-        self,
-        wall: Callable[[], float] = time.time,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._wall, self._monotonic = wall, monotonic
+    def __init__(self) -> None:
         self._ahead = self._now()
 
     def jump(self) -> float | None:
@@ -33,4 +32,4 @@ class ClockWatch:
         return jumped if abs(jumped) > JUMP_S else None
 
     def _now(self) -> float:
-        return self._wall() - self._monotonic()
+        return wall_seconds() - time.monotonic()

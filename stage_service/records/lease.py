@@ -8,7 +8,6 @@ import logging
 import os
 import secrets
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from reconstruction.files.durable import flush, write_json
 from reconstruction.reading import read_json
 from stage_service.records.audit import NotRecorded
-from stage_service.records.clock import boot_seconds
+from stage_service.records.clock import boot_seconds, wall_seconds
 
 log = logging.getLogger("hairstage.lease")
 LONGEST_LEASE_S = 86400.0
@@ -87,7 +86,7 @@ class Leases:
         self,
         path: Path,
         clock: Callable[[], float] = boot_seconds,
-        wall: Callable[[], float] = time.time,
+        wall: Callable[[], float] = wall_seconds,
     ) -> None:
         self._path, self._clock, self._wall = path, clock, wall
         self._writing = threading.Lock()

@@ -64,6 +64,7 @@ class World:
         self.late: list[str] = []  # serial requests answered together with the next one
         self.garbage = b""  # sent before the next serial reply
         self.hold_pulses = False  # the trigger box fires, and does not answer until `Wires.flush`
+        self.pulses_held = 0
         self.put_on: Callable[[set[Any]], object] = lambda _lamps: None  # what lights up, at once
 
     def light(self, lamps: set[int]) -> None:
@@ -116,6 +117,8 @@ class Lights(socketserver.BaseRequestHandler):
             if world.deaf_lights:
                 continue
             with world.lock:
+                if self.server.dead:  # type: ignore[attr-defined]
+                    return
                 answer = self.answer(world, pdu)
             self.request.sendall(struct.pack(">HHHB", tid, 0, len(answer) + 1, unit) + answer)
 
@@ -274,6 +277,7 @@ class SerialPeer:
                         held += reply
                         continue
                     if self.world.hold_pulses and text.startswith("PULSE"):
+                        self.world.pulses_held += 1
                         held += reply
                         continue
                     garbage, self.world.garbage = self.world.garbage, b""
@@ -303,7 +307,7 @@ class Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, world: World, handler: type[socketserver.BaseRequestHandler]) -> None:
         super().__init__(("127.0.0.1", 0), handler)
-        self.world = world
+        self.world, self.dead = world, False
         self.links: set[Any] = set()
         threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
 
@@ -325,7 +329,9 @@ class Server(socketserver.ThreadingTCPServer):
                 link.shutdown(socket.SHUT_RDWR)
 
     def cut(self) -> None:
-        """Take no more connections, and end those that there are."""
+        """Take no more connections and requests, and end the connections that there are."""
+        with self.world.lock:
+            self.dead = True
         self.shutdown()
         self.server_close()
         self.drop()
