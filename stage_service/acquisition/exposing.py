@@ -11,7 +11,7 @@ from reconstruction import Step
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, SafetyRefusal
-from stage_service.devices.lights.interface import lamps_lit, mismatch_todo
+from stage_service.devices.lights.interface import CONTRADICTED, lamps_lit, mismatch_todo
 from stage_service.plan.flash import FASTEST_HZ, SLOW_HZ, SLOWEST_HZ, Trains
 
 
@@ -113,6 +113,7 @@ class Exposing:
         if status.lit != expected:
             doing = f"looking after the exposure of step {step.index} ({step.light or step.kind})"
             received, todo = f"{status.lit} lit{status.causes}", mismatch_todo(expected, status)
+            lights.contradicted |= CONTRADICTED in todo
             raise DeviceError(lights.name, doing, lamps_lit(expected), received, todo)
 
     def _check_projectors(self, step: Step) -> None:

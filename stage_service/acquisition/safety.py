@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import DeviceError, SafetyRefusal
-from stage_service.devices.lights.interface import LightBank, LightStatus
+from stage_service.devices.lights.interface import CONTRADICTED, LightBank, LightStatus
 from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.trigger.interface import TriggerStatus
 
@@ -94,7 +94,10 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
         if not problem and not can.reads_back:
             unread += f" {device.name}: off was sent, but cannot be read back."
     if not problems and not unread:
-        return Blackout(True, "every lamp and projector was read back dark")
+        dark = "every lamp and projector was read back dark"
+        if lights.contradicted:
+            dark += f"; earlier {lights.name} {CONTRADICTED}: look before anybody goes in"
+        return Blackout(True, dark)
     only_lamps = beams is None or beams.capabilities.reads_back
     accepted = not problems and only_lamps and config.lights.accept_unverified_blackout
     return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)

@@ -54,8 +54,8 @@ class HoldChanged(RuntimeError):
 
     def __init__(self, held: Held) -> None:
         super().__init__(
-            f"the queue is held for a reason that you have not read: {held.text}. Send the hold's "
-            f"id, {held.id}, if what waits may begin all the same"
+            f"the queue is held for a reason that you have not read: {held.text}. Release that "
+            f"hold, {held.id}, if queued captures may begin all the same"
         )
         self.held, self.hold = held.text, held.id
 

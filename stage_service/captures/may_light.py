@@ -143,6 +143,8 @@ _ERRORS: dict[str, Callable[[Facts], Exception | None]] = {
     "held": lambda f: NotNow(f"held: {f.held.text}") if f.held is not None else None,
     "flashes": lambda f: f.flashes,
 }
-_UNKNOWN = "nobody knows yet whether the stage is dark: POST /devices/blackout"
-_STALE = "it was {:.0f} s until it could begin, and whoever asked may look away: ask again"
+_UNKNOWN = "whether the stage is dark is not known: send a blackout"
+_STALE = (
+    "{:.0f} s passed before it could begin; whoever started it may no longer watch: start it again"
+)
 _UNREAD = "the captures on the disk are still being read: {:,} to come"

@@ -16,11 +16,14 @@ from stage_service.jobs.queue import JobQueue, JobsUnavailable, Waiting
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
+from stage_service.records.logs import CAUSES
 
 log = logging.getLogger("hairstage.jobs")
 POLL_S = 0.5
 COUNT_S = 5.0
 """How old the count of jobs that wait may be."""
+FOLLOWING = "following the jobs"
+"""As the log names what is wrong with that."""
 JOB_END = "job.end"
 MOST_ENDS = 1000
 """Jobs, and lines of the audit log, that are looked at for ends that nobody has recorded."""
@@ -48,7 +51,6 @@ class JobFollower:
         self._certain: set[str] = set()  # captures whose job is there
         self._wake = threading.Event()
         self._closed = False
-        self._told: str | None = None
         self._seen: dict[str, Job] = {}  # the newest, and whatever is not done
         self._audited: set[str] | None = None  # jobs that had ended before
         self._thread = threading.Thread(target=self._run, name="job-events", daemon=True)
@@ -104,13 +106,11 @@ class JobFollower:
                 self._tell()
                 if time.monotonic() - self.waiting_at > COUNT_S:
                     self.waiting, self.waiting_at = self._queue.waiting(), time.monotonic()
-                self._told = None
-            except Exception as error:  # the thread goes on, whatever is wrong with the database
-                if self._closed or str(error) == self._told:
-                    continue
-                self._told = str(error)
-                known = isinstance(error, JobsUnavailable)
-                log.error("%s", error, exc_info=None if known else error)
+                CAUSES.over(log, FOLLOWING)
+            except JobsUnavailable:  # which the queue has logged
+                pass
+            except Exception as error:  # the thread goes on
+                CAUSES.failed(log, FOLLOWING, error, error)
 
     def _enqueue_what_is_owed(self) -> None:
         if not self._owed:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import logging
+import math
 import os
 import re
 import secrets
-import sqlite3
 import threading
 import time
 from collections.abc import Collection, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +25,7 @@ from dbos import (
     EnqueueOptions,
     WorkflowStatus,
 )
+from sqlalchemy import make_url
 
 from reconstruction import Model
 from reconstruction.reading import printable
@@ -32,6 +33,8 @@ from stage_service.jobs.pipelines import PIPELINES, RENDERING
 from stage_service.jobs.progress import read_progress
 from stage_service.jobs.records import Job, JobError, JobOutcome, JobState, PipelineRequest
 from stage_service.jobs.slots import Namespace
+from stage_service.jobs.sqlite_file import set_aside_if_broken
+from stage_service.records.logs import CAUSES, Folded
 
 log = logging.getLogger("hairstage.jobs")
 WORKFLOW = "hairstage_job"
@@ -56,8 +59,20 @@ STATEMENT_S = 8
 """The service waits no longer for an answer; a worker has the time."""
 
 
-_RAISED = re.compile(r"^\([a-z_0-9.]+\.\w+\) ")
-"""The class of a database driver's error, which SQLAlchemy puts in front of its sentence."""
+UNANSWERED_S = 10.0
+"""One that has left a request without an answer for so long is asked nothing more until it has
+answered that: each request would keep a thread."""
+CAUSE = "the job database"
+"""As the log names what is wrong with it."""
+LIBRARIES = Folded(
+    log, CAUSE, {"dbos", "sqlalchemy"}, {"psycopg", "sqlalchemy", "sqlite3", "connection"}
+)
+"""They log each failure of each of their threads, with tracebacks: 130 lines a second."""
+_RAISED = re.compile(r"^(\([a-z_0-9.]+\.\w+\)|DBOS Error \d+:) ")
+"""The class of an error, which SQLAlchemy or DBOS puts in front of its sentence."""
+_CONNECTION = re.compile(r"^connection .* failed: (FATAL: +)?")
+"""What libpq puts in front of why there is no connection."""
+_MEANWHILE = "Captures and blackout go on; jobs begin again by themselves when it is back."
 
 
 class NoSuchJob(LookupError):
@@ -118,7 +133,8 @@ class JobQueue:
         self._lock = threading.Lock()
         self._client: DBOSClient | None = None
         self._names: Namespace | None = None
-        self.problem: str | None = None
+        self._problem: str | None = None
+        self._calls: dict[object, float] = {}  # since when each waits for the database
         self.set_aside: str | None = None
 
     @property
@@ -128,6 +144,11 @@ class JobQueue:
             self._root.mkdir(parents=True, exist_ok=True)
             self._names = Namespace(self._root)
         return self._names
+
+    @property
+    def problem(self) -> str | None:
+        """Why it cannot be used, as a sentence for operators; None where it can be."""
+        return self._silence() or self._problem
 
     def connect(self) -> None:
         """Open the database, now. Raises `JobsUnavailable`."""
@@ -245,18 +266,45 @@ class JobQueue:
     @contextmanager
     def _database(self) -> Iterator[DBOSClient]:
         """The open database; whatever it raises is `JobsUnavailable`."""
+        if (silent := self._silence()) is not None:
+            CAUSES.failed(log, CAUSE, silent)
+            raise JobsUnavailable(silent)
+        call = object()
+        self._calls[call] = time.monotonic()
         try:
-            with self._lock:
+            if not self._lock.acquire(timeout=UNANSWERED_S):
+                raise TimeoutError("it is still being connected to")
+            try:
                 if self._client is None:
                     self._client = self._open()
                 client = self._client
+            finally:
+                self._lock.release()
             yield client
         except Exception as error:
-            first = next(iter(str(error).splitlines()), "") or type(error).__name__
-            reason = _RAISED.sub("", first)
-            self.problem = f"the job database cannot be used: {reason}"
-            raise JobsUnavailable(self.problem) from error
-        self.problem = None
+            self._problem = self._sentence(_reason(error))
+            CAUSES.failed(log, CAUSE, f"{type(error).__name__}: {_first_line(error)}")
+            raise JobsUnavailable(self._problem) from error
+        finally:
+            del self._calls[call]
+        self._problem = None
+        CAUSES.over(log, CAUSE)
+
+    def _silence(self) -> str | None:
+        """Why nothing more is asked now; None where it may be."""
+        waits = time.monotonic() - min(list(self._calls.values()), default=math.inf)
+        if waits < UNANSWERED_S:
+            return None
+        return self._sentence(f"a request has had no answer for {waits:.0f} s")
+
+    def _sentence(self, reason: str) -> str:
+        """What is wrong, for operators."""
+        url = make_url(database_url(self._root))
+        if url.get_backend_name() == "sqlite":
+            return f"The job database {url.database} cannot be used: {reason}. {_MEANWHILE}"
+        host = url.host or url.query.get("host") or "this machine"
+        port = url.port or url.query.get("port") or 5432
+        return f"The job database at {host}:{port} does not answer: {reason}. {_MEANWHILE}"
 
     def _open(self) -> DBOSClient:
         names = self.names
@@ -267,7 +315,7 @@ class JobQueue:
             # Service and worker may find the same broken file at the same time.
             with file.with_suffix(".lock").open("a") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                self.set_aside = _set_aside_if_broken(file)
+                self.set_aside = set_aside_if_broken(file)
                 DBOS.migrate(url)
         else:
             DBOS.migrate(database_url(self._root))
@@ -317,39 +365,16 @@ class JobQueue:
         )
 
 
-def _set_aside_if_broken(file: Path) -> str | None:
-    """Rename a SQLite file, and what belongs to it, that is none or damaged; says what was done."""
-    if not file.exists():
-        return None
-    reason = _broken(file)
-    if reason is None:
-        return None
-    aside = f"{file.name}.broken-{datetime.now(UTC):%Y%m%d-%H%M%S}"
-    for suffix in ("-wal", "-shm", "-journal", ""):
-        part = file.with_name(file.name + suffix)
-        if part.exists():
-            part.rename(file.with_name(aside + suffix))
-    told = (
-        f"{file} was broken ({reason}) and was set aside as {aside}: its jobs are lost. "
-        "Models that were begun stay as they are: restart workers, and ask for jobs anew"
-    )
-    log.error("%s", told)
-    return told
+def _reason(error: Exception) -> str:
+    """Why, in the database's own words, without those of the libraries in between."""
+    said = _CONNECTION.sub("", _RAISED.sub("", _first_line(error))).strip().rstrip(".")
+    if "statement timeout" in said:
+        return f"a request took longer than {STATEMENT_S} s"
+    return said or type(error).__name__
 
 
-def _broken(file: Path) -> str | None:
-    """What is wrong with a SQLite file; None where it is sound, or another uses it just now."""
-    try:
-        with closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True, timeout=30)) as database:
-            (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
-            tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master")}
-    except sqlite3.OperationalError:  # locked, or not to be opened: what follows says so
-        return None
-    except sqlite3.DatabaseError as error:
-        return str(error)
-    if found != "ok":
-        return str(found)
-    return None if not tables or "dbos_migrations" in tables else "it is another program's"
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "")
 
 
 def _time(milliseconds: int | None) -> str | None:

@@ -27,7 +27,7 @@ from stage_service.jobs.queue import WORKFLOW, JobQueue, JobsUnavailable, databa
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.slots import BEAT_S, WorkerSlot, hold_dead
 from stage_service.jobs.steps import STEPS, StepContext
-from stage_service.records.logs import about
+from stage_service.records.logs import CAUSES, about
 from stage_service.signals import taken
 from stage_service.stopping import Ending, Step, end_all
 
@@ -41,6 +41,8 @@ DATABASE_S = 3.0
 """A job database that does not answer keeps a worker that is to stop for no longer."""
 LOOK_S = 5.0
 """How often a worker looks whether another has died on a job."""
+LOOKING = "looking after other workers"
+"""As the log names what is wrong with that."""
 RETRY_S = 5.0
 """How long a step that failed waits before it is tried again."""
 
@@ -129,8 +131,11 @@ class Worker:
                 if time.monotonic() - looked > LOOK_S:
                     looked = time.monotonic()
                     self._take_up(take_over)
-            except (OSError, JobsUnavailable) as error:  # for a while
-                log.warning("%s", error)
+                CAUSES.over(log, LOOKING)
+            except JobsUnavailable:  # which the queue has logged
+                pass
+            except Exception as error:  # for a while
+                CAUSES.failed(log, LOOKING, error, None if isinstance(error, OSError) else error)
 
     def _take_up(self, take_over: str | None) -> None:
         for executor in self.queue.executors() - {self.queue.names.executor(self.slot)}:
@@ -187,6 +192,8 @@ def run_worker(
     """
     worker = Worker(root, concurrency)
     names = worker.queue.names
+    # A handler of its own would not log as ours do, and would not know of causes.
+    logging.getLogger("dbos").addHandler(logging.NullHandler())
     logging.getLogger("dbos").addFilter(_not_told_twice)
     DBOS(
         config={

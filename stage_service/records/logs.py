@@ -1,12 +1,15 @@
-"""Log records as lines of JSON, with the capture and the job that they are about."""
+"""Log records: as lines of JSON, with what they are about; and no more than a cause is worth."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 _ABOUT: ContextVar[dict[str, str]] = ContextVar("about", default={})  # noqa: B039 (never changed)
@@ -27,9 +30,9 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as JSON."""
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        at = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
         told = {
-            "time": time,
+            "time": at,
             "level": record.levelname,
             "logger": record.name,
             "thread": record.threadName,
@@ -39,3 +42,94 @@ class JsonLines(logging.Formatter):
         if record.exc_info:
             told["error"] = self.formatException(record.exc_info)
         return json.dumps(told)
+
+
+EVERY_S = 60.0
+"""A cause that lasts has a line in the log so often, with how many times it has come meanwhile."""
+MOST_CAUSES = 1000
+"""The oldest are forgotten beyond that."""
+
+
+@dataclass
+class _Cause:
+    """Since when it lasts (None: it is over), how often it has come in all and since the newest
+    line, when that was logged, and whether a line of its present run is in the log."""
+
+    since: float | None = None
+    count: int = 0
+    unlogged: int = 0
+    logged: float | None = None
+    begun: bool = False
+
+
+class Causes:
+    """Trouble that comes again and again, by cause: a line when it begins, one a minute with a
+    count while it lasts, and one when it is over. Safe to call from several threads."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._causes: dict[str, _Cause] = {}
+        self._lock = threading.Lock()
+
+    def failed(
+        self,
+        log: logging.Logger,
+        cause: str,
+        detail: object,
+        error: BaseException | None = None,
+    ) -> None:
+        """It has come, once more; `error` is the traceback to log with a line."""
+        with self._lock:
+            one = self._causes.pop(cause, None) or _Cause()
+            self._causes[cause] = one  # the newest last
+            while len(self._causes) > MOST_CAUSES:
+                del self._causes[next(iter(self._causes))]
+            now = self._clock()
+            one.since = now if one.since is None else one.since
+            one.count += 1
+            one.unlogged += 1
+            if one.logged is not None and now - one.logged < EVERY_S:
+                return
+            times, lasts = one.unlogged, now - one.since
+            one.logged, one.unlogged, one.begun = now, 0, True
+        again = f" ({times} times, and for {lasts:.0f} s now)" if times > 1 else ""
+        log.error("%s: %s%s", cause, detail, again, exc_info=error)
+
+    def over(self, log: logging.Logger, cause: str) -> None:
+        """It is over, or never was."""
+        if cause not in self._causes:
+            return
+        with self._lock:
+            one = self._causes.get(cause)
+            if one is None or one.since is None:
+                return
+            lasted, count, begun = self._clock() - one.since, one.count, one.begun
+            one.since, one.count, one.begun = None, 0, False
+        if begun:
+            log.warning("%s: over after %.0f s (it came %d times)", cause, lasted, count)
+
+
+CAUSES = Causes()
+"""Those of this process."""
+
+
+class Folded(logging.Filter):
+    """Counts records of libraries that log every failure of one `cause` as that cause; on a handler
+    it keeps them from the log. `loggers` are the libraries', `words` what such a record has in its
+    text or its traceback."""
+
+    def __init__(self, log: logging.Logger, cause: str, loggers: set[str], words: set[str]) -> None:
+        super().__init__()
+        self._log, self._cause, self._loggers, self._words = log, cause, loggers, words
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """False for what is counted."""
+        if record.name.partition(".")[0] not in self._loggers:
+            return True
+        text = record.getMessage()
+        raised = record.exc_info[1] if record.exc_info else None
+        where = type(raised).__module__ if raised is not None else ""
+        if not any(word in text or where.startswith(word) for word in self._words):
+            return True
+        CAUSES.failed(self._log, self._cause, text.partition("\n")[0])
+        return False

@@ -251,10 +251,13 @@ def exit_on_sigterm() -> None:
 
 
 def log_to_stderr(as_json: bool = False) -> None:
-    """Log records of level INFO and above go to stderr."""
+    """Log records of level INFO and above go to stderr; of the job database's libraries, those of
+    its being away are counted alone."""
+    from stage_service.jobs.queue import LIBRARIES
     from stage_service.records.logs import JsonLines
 
     handler = logging.StreamHandler(sys.stderr)
+    handler.addFilter(LIBRARIES)
     plain = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
     handler.setFormatter(JsonLines() if as_json else plain)
     logging.basicConfig(level=logging.INFO, handlers=[handler])

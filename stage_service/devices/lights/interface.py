@@ -44,6 +44,10 @@ class LightStatus:
         )
 
 
+CONTRADICTED = "reported lamps as off that were commanded on"
+"""By a read-back without a cause, which leaves its "dark" in doubt; the console looks for this."""
+
+
 def lamps_lit(count: int) -> str:
     """A number of lamps, as errors have it."""
     return f"{count} lamp{'' if count == 1 else 's'} lit"
@@ -54,12 +58,8 @@ def mismatch_todo(expected: int, status: LightStatus) -> str:
     if status.causes:
         return "Clear the cause at the stage."
     if status.lit < expected:
-        return f"{CONTRADICTS}: look at the lamps, and check their drivers' supply."
+        return f"The bank {CONTRADICTED}: look at them, and check their drivers' supply."
     return "Check the lamp drivers, and that nobody else writes to the bank."
-
-
-CONTRADICTS = "The bank's read-back contradicts the command"
-"""It reports lamps as off that were commanded on, and no cause; the console looks for this."""
 
 
 class LightBank(Protocol):

@@ -5,11 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 from stage_service.config import SafetyLimits
 from stage_service.devices.errors import DeviceError, SafetyRefusal
-from stage_service.devices.lights.interface import LightBank, LightStatus, Lit
+from stage_service.devices.lights.interface import (
+    CONTRADICTED,
+    LightBank,
+    LightStatus,
+    Lit,
+)
 from stage_service.devices.permission import lighting
 
 LitTimes = dict[int, deque[tuple[float, float]]]
@@ -41,6 +47,8 @@ class LimitedLightBank:
         self.name, self.capabilities = bank.name, bank.capabilities
         self._bank, self._limits, self._clock = bank, limits, clock
         self._lights = lights
+        self.contradicted = False
+        """Whether the bank `CONTRADICTED`, and has confirmed no lit lamp since."""
         self._level = 1.0  # what a bank has at power-up, and one without levels always
         self._since: dict[int, float] = {}
         self._past: LitTimes = {} if past is None else past
@@ -72,13 +80,15 @@ class LimitedLightBank:
         doing = f"putting lamp {lamp} on"
         with lighting(doing), self._changed:
             self._allow((lamp,), doing)
-            self._bank.select(lamp)
+            with self._confirming():
+                self._bank.select(lamp)
 
     def all_on(self) -> None:
         doing = "putting all lamps on"
         with lighting(doing), self._changed:
             self._allow(range(self.count), doing)
-            self._bank.all_on()
+            with self._confirming():
+                self._bank.all_on()
 
     def off(self) -> None:
         """Put every lamp off; never refused. An error names what may still be lit."""
@@ -249,6 +259,16 @@ class LimitedLightBank:
     def _raise_refusal(self) -> None:
         if self._refusal is not None:
             raise self._refusal
+
+    @contextmanager
+    def _confirming(self) -> Iterator[None]:
+        """Whether the bank confirms that it lights what it is commanded to."""
+        try:
+            yield
+        except DeviceError as error:
+            self.contradicted |= CONTRADICTED in str(error)
+            raise
+        self.contradicted = False
 
     def _naming_the_lit(self, error: DeviceError) -> DeviceError:
         if not self._since:

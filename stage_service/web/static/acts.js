@@ -45,17 +45,31 @@ export function left(c) {
 export async function askName() {
   const known = (localStorage.getItem("name") ?? S.who?.name ?? "").trim();
   if (known) return known;
+  const name = await nameIn("Your name, as the others see it", "Steer");
+  localStorage.setItem("name", name);
+  return name;
+}
+
+/** A name that the person types. Raises `LEFT` where they type none. */
+export async function nameIn(label, go) {
+  const field = h("input", { name: "holder", required: true, maxlength: 100, pattern: ".*\\S.*", title: "a name", autocomplete: "name" });
+  await confirmed(label, [h("label", label, field)], go);
+  return field.value.trim();
+}
+
+/** Returns once the person has confirmed `content` by the button `go`. Raises `LEFT` where they have not. Not modal, and
+ * not the browser's own, which would keep them from Blackout. */
+export function confirmed(label, content, go) {
   return new Promise((done, left_) => {
-    const field = h("input", { name: "holder", required: true, maxlength: 100, pattern: ".*\\S.*", title: "a name", autocomplete: "name" });
-    const box = h("dialog", { "aria-label": "who steers" }, h("form", { onsubmit: (event) => {
+    const box = h("dialog", { "aria-label": label, onkeydown: (event) => { if (event.key === "Escape") box.close(); } }, h("form", { onsubmit: (event) => {
       event.preventDefault();
-      localStorage.setItem("name", field.value.trim());
-      done(field.value.trim());
+      done();
       box.close();
-    } }, h("label", "Your name, as the others see it", field), h(".line", h("button.go", "Steer"), button("Cancel", () => box.close()))));
+    } }, content, h(".line", h("button.go", go), button("Cancel", () => box.close()))));
     box.addEventListener("close", () => { box.remove(); left_(LEFT); }); // nothing, after `done`
+    for (const other of document.querySelectorAll("dialog")) other.close();
     document.body.append(box);
-    box.showModal();
+    box.show();
   });
 }
 

@@ -4,7 +4,7 @@ import { attempt } from "./acts.js";
 import { ask } from "./ask.js";
 import { dismiss, pressed, right } from "./blackout.js";
 import { button, clock, h, keyed, say } from "./dom.js";
-import { lampWords } from "./lamps.js";
+import { contradicts, lampWords } from "./lamps.js";
 import { S, changed, load, silence, watchdogSentence } from "./state.js";
 
 const STOP = "Press the wired emergency stop.";
@@ -51,6 +51,7 @@ function unanswered() {
 function answer() {
   if (!S.out || !pressed?.answer) return null;
   const { at, safe, detail } = pressed.answer;
+  if (safe && contradicts(detail)) return alarm(".accepted", `Reported dark at ${clock(at)}.`, `Blackout of this page: ${detail}.`);
   if (safe) return alarm(".calm", `Dark, verified at ${clock(at)},`, "by the blackout of this page. What has happened since is not shown before you log in.");
   return alarm("", "UNSAFE: treat every lamp as lit.", `Blackout of ${clock(pressed.at)}, answered at ${clock(at)}: ${detail} ${watchdogSentence()} ${STOP}`);
 }

@@ -22,7 +22,7 @@ export const own = {
 
 /** "word": the service has sent something; "over": nobody is logged in any more. A browser has six connections to a
  * host: "yield" gives up pictures and their figures, so that a blackout has one, "yield all" every GET and the events;
- * "yielded": all of it may be requested again. */
+ * "yielded": all of it may be requested again, once what a blackout has ended was read. */
 export const service = new EventTarget();
 export const tell = (kind) => service.dispatchEvent(new Event(kind));
 const PATIENCE_MS = 30_000;

@@ -82,5 +82,4 @@ async function send() {
     }
     await new Promise((later) => setTimeout(later, AGAIN_MS));
   }
-  tell("yielded");
 }

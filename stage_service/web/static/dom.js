@@ -110,8 +110,10 @@ export function clock(iso) {
   return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString("sv")} ${time}`;
 }
 
-/** A sentence of the service, with its times (ISO 8601, UTC) as this machine's clock has them. */
-export const local = (text) => (text ?? "").replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)/g, (iso) => clock(iso));
+/** A sentence of the service, with its times (ISO 8601, or a date and a time in UTC) as this machine's clock has them. */
+export const local = (text) => (text ?? "")
+  .replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)/g, (iso) => clock(iso))
+  .replace(/(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC/g, (_, day, time) => clock(`${day}T${time}Z`));
 
 /** A name of the API in words, with its unit after a comma. */
 export const words = (name) => name.replace(/_(mm|px|deg|s|hz)$/, (_, unit) => `, ${unit === "hz" ? "Hz" : unit}`).replaceAll("_", " ");

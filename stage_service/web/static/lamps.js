@@ -20,19 +20,18 @@ const WORDS = {
   unknown: UNKNOWN,
 };
 
-/** The capture in which the light bank's read-back contradicted a command, where it is the last one. */
-export function contradicted() {
-  return S.capture?.error?.includes("read-back contradicts the command") ? S.capture.id : null;
-}
+/** Whether a sentence of the service says that the light bank's read-back was wrong about lamps. */
+export const contradicts = (text) => Boolean(text?.includes("reported lamps as off that were commanded on"));
+const doubted = (health) => contradicts(health?.lamps_detail) || contradicts(S.capture?.error);
 
 /** Which of these `GET /health` has: dark (read back), doubted (read back by a bank whose read-back contradicted a
- * command in the last capture), said (somebody looked), accepted (sent to a bank that cannot read back), use (a capture has them),
+ * command before), said (somebody looked), accepted (sent to a bank that cannot read back), use (a capture has them),
  * latched (a blackout failed), unknown. */
 export function lampState(health) {
   if (health?.latch) return "latched";
   if (health?.lamps_accepted) return "accepted";
   const state = { dark: "dark", "said to be dark": "said", "in use": "use" }[health?.lamps] ?? "unknown";
-  return state === "dark" && contradicted() ? "doubted" : state;
+  return state === "dark" && doubted(health) ? "doubted" : state;
 }
 
 /** `bar`, `headline`, `lit` and `fact` are named for their places, `tone` is a class. `detail` is how it is
@@ -51,7 +50,7 @@ export function lampWords(health) {
 
 function alarm(state, detail) {
   if (state === "accepted") return ["Off was sent, but the light bank cannot report whether the lamps are off. ", `${detail} A blackout cannot find out: look before anybody goes in.`];
-  if (state === "doubted") return ["Reported dark by a light bank whose read-back contradicted a command. ", `In capture ${contradicted()} it reported lamps as off that were commanded on. Look before anybody goes in.`];
+  if (state === "doubted") return ["Reported dark by a light bank whose read-back contradicted a command. ", `${contradicts(S.capture?.error) ? `In capture ${S.capture.id} it` : "It"} reported lamps as off that were commanded on. Look before anybody goes in.`];
   if (state === "unknown" && detail) return ["It is not known whether the lamps are off. ", `${detail} A blackout (F9) sends off, and reads it back where the device can.`];
   return null;
 }

@@ -2,10 +2,10 @@
 
 import { abort, askName, attempt, left, notice } from "./acts.js";
 import { alarmBox } from "./alarms.js";
-import { service } from "./ask.js";
+import { service, tell } from "./ask.js";
 import { blackout, pressed, resend, resume } from "./blackout.js";
 import { button, clock, h, say, seconds } from "./dom.js";
-import { lampWords } from "./lamps.js";
+import { contradicts, lampWords } from "./lamps.js";
 import { loginForm } from "./login.js";
 import { S, begin, busy, changed, load, mine, onChange, releaseLease, silence, takeLease } from "./state.js";
 import { blackScreen } from "./black.js";
@@ -114,12 +114,14 @@ function show() {
 function onPressed() {
   changed();
   const answer = pressed?.answer;
+  if (!answer && !pressed?.going) tell("yielded"); // refused, or dismissed
   if (!answer || S.out) return;
   const took = seconds((answer.at - pressed.at) / 1000);
-  load.now().catch(() => {}).then(() => { // it has ended a capture, which no event may say
-    if (!answer.safe) notice(S.health?.latch ? "Blackout: unknown, unsafe, for the reason above." : `Blackout: ${answer.detail}`, "bad");
-    else notice(`${lampWords(S.health).state === "doubted" ? "Reported dark" : "Dark, verified"}, after ${took}.`, "good");
-  });
+  const doubted = contradicts(answer.detail) || contradicts(S.capture?.error);
+  if (!answer.safe) notice("Blackout: unknown, unsafe. Treat every lamp as lit.", "bad");
+  else notice(`${doubted ? "Reported dark" : "Dark, verified"}, after ${took}.`, "good");
+  // What it has ended is read before pictures take the connections again: events may be refused to this page.
+  load.now().catch(() => {}).then(() => tell("yielded"));
 }
 
 function onOver() {

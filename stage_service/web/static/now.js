@@ -1,8 +1,8 @@
 // The stage as it is: the light that is lit, how far the capture is, and how it stands with darkness.
 
-import { left, steering } from "./acts.js";
+import { confirmed, left, nameIn, steering } from "./acts.js";
 import { ask, captureAt, get } from "./ask.js";
-import { bytes, clock, h, keyed, number, say, seconds } from "./dom.js";
+import { bytes, clock, h, keyed, local, number, say, seconds } from "./dom.js";
 import { dome } from "./dome.js";
 import { lampWords, suspects } from "./lamps.js";
 import { S, busy, load, silence, unlit } from "./state.js";
@@ -55,7 +55,9 @@ export function open(view) {
 
   /** End the hold that this page shows, once the person has read why it is there. */
   async function release(hold) {
-    if (!hold || !confirm(`The queue is held:\n\n${hold.reasons.map((r) => `${clock(r.at)}  ${r.why}`).join("\n")}\n\nBegin what waits, one after the other?`)) return;
+    if (!hold) return;
+    const reasons = hold.reasons.map((r) => h("li", `${clock(r.at)}: ${local(r.why)}`));
+    await confirmed("go on with the queue", [h("p", "The queue is held:"), h("ul.problems", reasons), h("p", "Begin the queued captures, one after the other?")], "Begin");
     try {
       await ask("POST /queue:go-on", { hold: hold.id });
     } finally {
@@ -208,7 +210,7 @@ export function open(view) {
     const q = S.queue;
     say(queueSaid, q.held ? `Held: ${q.held}. No queued capture begins until somebody goes on with the queue.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "The queue is empty.");
     keyed(line, q.waiting, (x) => x.id, (x) => {
-      const go = steering("start now", () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: prompt("Who at the stage answers for the flashes?") } : undefined), { kind: "quiet", lights: true });
+      const go = steering("start now", async () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: await nameIn("Who at the stage answers for the flashes", "Start") } : undefined), { kind: "quiet", lights: true });
       const up = steering("first", () => ask(`PATCH /queue/${x.id}`, { place: 0 }), { kind: "quiet" });
       const at = () => S.queue.waiting.findIndex((y) => y.id === x.id);
       const place = (text, by, more) => steering(text, () => ask(`PATCH /queue/${x.id}`, { place: at() + by }), { kind: "quiet", ready: () => S.queue.waiting[at() + by] !== undefined, ...more });

@@ -184,7 +184,7 @@ def test_the_cause_of_dark_lamps_is_told(bench):
 def test_a_count_without_a_cause_is_a_contradiction(bench):
     one = bench(TCP, Fault("lights", "lies", 1))
     one.pulses = 1
-    with pytest.raises(DeviceError, match=r"received 0 lit\. The bank's read-back contradicts"):
+    with pytest.raises(DeviceError, match=r"received 0 lit\. The bank reported lamps as off"):
         one.driver.select(1)
 
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 from stage_service.acquisition.safety import blackout
 from stage_service.devices.errors import DeviceTimeout
-from stage_service.devices.lights.interface import LightCapabilities
+from stage_service.devices.lights.interface import LightCapabilities, LightStatus
 from stage_service.devices.projectors.interface import ProjectorCapabilities
 
 
@@ -28,6 +28,18 @@ class Beams:
 
     def is_dark(self):
         return not self.lit
+
+
+class Contradicted(Broken):
+    """A light bank that reports every lamp as off, as it did while they were commanded on."""
+
+    contradicted = True
+
+    def off(self):
+        pass
+
+    def status(self):
+        return LightStatus(False, False, False, 0)
 
 
 class Silent:
@@ -56,6 +68,12 @@ def test_a_fault_of_one_driver_does_not_keep_the_projectors_lit():
     assert "ZeroDivisionError: a fault of the driver" in result.detail
     assert "Its watchdog puts it off 2 s after the service's last heartbeat" in result.detail
     assert result.blocks
+
+
+def test_dark_by_a_contradicted_read_back_is_said_to_be_that():
+    result = blackout(stage(Contradicted(), Beams()))
+    assert result.state == "dark"
+    assert "earlier lights reported lamps as off that were commanded on" in result.detail
 
 
 def test_what_cannot_be_read_back_is_unknown_and_blocks_unless_that_is_accepted():

@@ -6,7 +6,7 @@ import asyncio
 import json
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -141,10 +141,8 @@ def test_others_never_have_what_is_kept(steps):
     for name, take in steps * 3:
         owner = owners[name]
         if take:
-            try:
+            with suppress(NoPlace):
                 found.take("streams", owner)
-            except NoPlace:
-                pass
         elif found.held("streams", owner):
             found.leave("streams", owner)
         others = sum(found.held("streams", owners[name]) for name in "abc")

@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 import sqlite3
+import threading
 from pathlib import Path
 
 import pytest
@@ -106,19 +107,64 @@ def test_progress_that_cannot_be_read_is_no_progress(text, tmp_path):
     assert read_progress(Model(tmp_path), "job-1") is None
 
 
+WHY = {"down": "Connection refused", "deaf": "connection timeout expired"}
+MEANWHILE = "Captures and blackout go on; jobs begin again by themselves when it is back."
+
+
 def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(queues, "CONNECT_S", 2)  # the least that libpq takes
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         ports = {"down": 1, "deaf": deaf.getsockname()[1]}
-        for port in ports.values():
-            url = f"postgresql://nobody@127.0.0.1:{port}/nothing"
+        for which, port in ports.items():
+            url = f"postgresql://nobody:secret@127.0.0.1:{port}/nothing"
             monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", url)
             queue = JobQueue(tmp_path)
-            with pytest.raises(JobsUnavailable, match="the job database cannot be used"):
+            with pytest.raises(JobsUnavailable) as refusal:
                 queue.all()
-            assert queue.problem is not None
-            assert "psycopg" not in queue.problem
+            place = f"The job database at 127.0.0.1:{port} does not answer"
+            assert str(refusal.value) == queue.problem == f"{place}: {WHY[which]}. {MEANWHILE}"
             queue.close()
+
+
+def test_a_file_that_cannot_be_used_is_told_in_a_sentence(monkeypatch, tmp_path):
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", f"sqlite:////{tmp_path}/folder")
+    queue = JobQueue(tmp_path)
+    with pytest.raises(
+        JobsUnavailable, match=r"^The job database /\S*folder cannot be used: [^(]*$"
+    ):
+        queue.all()
+
+
+def test_a_server_that_is_silent_gets_no_more_requests_until_it_answers(monkeypatch, tmp_path):
+    """Each would keep a thread for as long as that lasts."""
+    queue, asked, answer = JobQueue(tmp_path), [], threading.Event()
+    assert queue.all() == []
+    client = queue._client
+
+    class Silent:
+        def list_workflows(self, **_: object) -> list[object]:
+            asked.append(1)
+            answer.wait()
+            return []
+
+    queue._client = Silent()
+    monkeypatch.setattr(queues, "UNANSWERED_S", 0.1)
+    thread = threading.Thread(target=queue.all)
+    thread.start()
+    until(lambda: queue.problem is not None)
+    for _ in range(3):
+        with pytest.raises(
+            JobsUnavailable, match="cannot be used: a request has had no answer for"
+        ):
+            queue.all()
+    assert asked == [1]
+    answer.set()
+    thread.join(60)
+    assert queue.problem is None
+    queue._client = client
+    assert queue.all() == []
+    queue.close()
 
 
 def completed(root: Path, name: str) -> CaptureStatus:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from postgresql import Missing, running
+from postgresql import Missing, PostgreSQL, running
 from waiting import until
 
 from reconstruction import Model
@@ -24,13 +26,19 @@ WORKER = Path(__file__).with_name("job_worker.py")
 
 
 @pytest.fixture(scope="module")
-def postgresql() -> Iterator[str]:
-    """The URL of a PostgreSQL server, started for these tests."""
+def server() -> Iterator[PostgreSQL]:
+    """A PostgreSQL server, started for these tests."""
     try:
-        with running() as server:
-            yield server.url
+        with running() as one:
+            yield one
     except Missing as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def postgresql(server: PostgreSQL) -> str:
+    """Its URL."""
+    return server.url
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
@@ -275,7 +283,46 @@ def test_a_statement_that_never_ends_does_not_hold_the_service(postgresql, tmp_p
     assert queue.all() == []
     with psycopg.connect(postgresql) as other:
         other.execute("LOCK TABLE dbos.workflow_status IN ACCESS EXCLUSIVE MODE")
-        with pytest.raises(JobsUnavailable, match="timeout"):
+        with pytest.raises(JobsUnavailable, match=r"a request took longer than 0\.5 s"):
             queue.all()
     assert queue.all() == []
     queue.close()
+
+
+def test_a_server_that_goes_and_comes_back_is_a_line_each_in_a_worker_s_log(
+    server, tmp_path, monkeypatch
+):
+    """F15: of DBOS's threads alone each would log several failures a second, with tracebacks."""
+    monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", server.url)
+    log = tmp_path / "log"
+    command = [sys.executable, "-m", "stage_service.cli", "worker", "--json", "--log-json"]
+    with log.open("w") as stderr:
+        worker = subprocess.Popen(
+            [*command, "--root", tmp_path / "root"],
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+        )
+    try:
+        assert "worker-0" in worker.stdout.readline()
+        server.stop()
+        try:
+            until(lambda: "the job database: " in log.read_text())
+        finally:
+            server.start()
+        until(lambda: "the job database: over after" in log.read_text())
+        # What it cannot do without: the jobs go on by themselves.
+        queue = JobQueue(tmp_path / "root")
+        queue.submit(PipelineRequest(name="reconstruct"), tmp_path, Model(tmp_path / "m"), job="j")
+        until(lambda: queue.get("j").state == "done", pause=0.1)
+        queue.close()
+    finally:
+        end(worker)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]  # none of another format
+    of_it = [line["message"] for line in lines if line["message"].startswith("the job database")]
+    assert len(of_it) == 2, of_it
+    times = re.fullmatch(r"the job database: over after \d+ s \(it came (\d+) times\)", of_it[1])
+    assert times is not None
+    assert int(times[1]) >= 2
+    told = [(line["logger"], line["level"]) for line in lines if "j: " not in line["message"]]
+    assert told == [("hairstage.jobs", "ERROR"), ("hairstage.jobs", "WARNING")]

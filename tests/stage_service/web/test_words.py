@@ -14,7 +14,7 @@ from browsing import says
 from waiting import until
 
 from simulators.peers.faults import Fault
-from stage_service.api import routes
+from stage_service.service import Service
 from stage_service.web.pages import STATIC
 
 pytestmark = pytest.mark.slow  # a browser costs some seconds of processor time a page
@@ -34,6 +34,33 @@ def test_a_bank_whose_read_back_contradicted_a_command_verifies_nothing(console)
     page.reload()
     says(page, "Reported dark")
     assert "verified" not in page.text_content("body")
+    # A capture that ends before a lamp is lit confirms nothing of the bank.
+    dark = {"lights": [], "projectors": []}
+    second = http.post("/captures", json={"plan": {**dark, "sentinels": False}})
+    if second.status_code == 202:
+        until(lambda: http.get(f"/captures/{second.json()['id']}").json()["outcome"])
+    says(page, "Reported dark")
+
+
+def test_a_dialog_keeps_blackout_by_mouse_and_by_key(console):
+    http, pages = console()
+    http.post("/queue:hold").raise_for_status()
+    http.post("/queue", json={"plan": PACED}).raise_for_status()
+    page = pages.open()
+    for press in (lambda: page.click("button.blackout"), lambda: page.keyboard.press("F9")):
+        http.post("/captures", json={"plan": PACED}).raise_for_status()
+        says(page, "Shooting")
+        page.click("text=Go on with the queue")
+        page.wait_for_selector("dialog:has-text('The queue is held')")
+        press()
+        says(page, "Dark, verified")
+        page.click("dialog button:text-is('Cancel')")
+        assert len(http.get("/queue").json()["waiting"]) == 1
+    page.click("text=Go on with the queue")
+    page.click("dialog button:text-is('Begin')")
+    says(page, "Shooting")
+    page.keyboard.press("F9")
+    says(page, "Dark, verified")
 
 
 def test_an_emergency_stop_is_named_apart_from_watchdog_and_interlock(console):
@@ -51,7 +78,12 @@ def test_times_are_those_of_the_clock_on_the_wall(console, monkeypatch):
     lease = http.post("/lease", json={"holder": "Eve", "seconds": 600}).json()
     mine = {"Hairstage-Lease": lease["token"]}
     http.post("/queue", json={"plan": SHORT}, headers=mine).raise_for_status()
+    hold = http.get("/queue").json()["hold"]
     page = pages.open()
+    started = datetime.fromisoformat(hold["reasons"][0]["at"]).astimezone()
+    page.wait_for_selector(f".quiet:has-text('{started:%H:%M:%S}')")
+    assert "UTC" not in page.inner_text("body")
+    http.post("/queue:go-on", json={"hold": hold["id"]}, headers=mine).raise_for_status()
     ends = datetime.fromisoformat(lease["expires"]).astimezone()
     page.wait_for_selector(f".quiet:has-text('Eve steers the stage until {ends:%H:%M:%S}')")
     page.click("nav >> text=Stage")
@@ -81,14 +113,14 @@ def test_a_capture_whose_folder_has_blanks_is_shown_as_it_is_listed(console, tmp
 
 def test_blackout_overtakes_the_pictures_that_a_slow_service_sends(console, small_rig, monkeypatch):
     """A browser has six connections to a host; here pictures hold five, and the events one."""
-    go_on, waiting, make = Event(), [], routes.png_preview
+    go_on, waiting, make = Event(), [], Service.preview
 
     def slow(*args: Any, **more: Any) -> bytes:
         waiting.append(1)
         assert go_on.wait(60)
         return make(*args, **more)
 
-    monkeypatch.setattr(routes, "png_preview", slow)
+    monkeypatch.setattr(Service, "preview", slow)
     camera = small_rig[
         small_rig.index("[[cameras]]") : small_rig.index('[[cameras]]\nname = "cam_b')
     ]
