@@ -104,7 +104,7 @@ class Ranged(Response):
         connection, pace, steers = connection_of(scope), scope["app"].state.pace, _steers(scope)
         more = False
         while first < last and not (connection is not None and connection.gone):
-            turn = await pace.turn(None) if more and not steers else Turn()
+            turn = await pace.turn(patient=True) if more and not steers else Turn()
             stop = min(first + CHUNK, last)
             try:
                 data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))

@@ -140,7 +140,7 @@ class _Held:
     async def pause(self) -> None:
         """Wait between two parts of a body, each of up to 64 KiB, for a turn's length."""
         if not self.owner.steers:
-            (await self._pace.turn(None)).end()
+            (await self._pace.turn(patient=True)).end()
 
     def sending(self, send: Send) -> Send:
         """`send`, which gives all but an upload's place back when the answer begins."""

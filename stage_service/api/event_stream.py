@@ -185,7 +185,7 @@ async def _follow(request: Request, number: int) -> AsyncIterator[bytes]:
             looked = clock()
             while (left := looked + LOOK_S - clock()) > 0:
                 much = not owner.steers and feed.untold(number, owner.steers) > FEW
-                turn = await pace.turn(None) if much else Turn()
+                turn = await pace.turn(patient=True) if much else Turn()
                 try:
                     number, text = await feed.after(number, left, owner.steers)
                 finally:

@@ -61,12 +61,12 @@ class Pace:
         self._one = asyncio.Lock()
         self._rested = 0.0
 
-    async def turn(self, within_s: float | None = WAIT_S) -> Turn:
-        """Wait for a turn. Raises `Paced` where there is none within this time."""
+    async def turn(self, *, patient: bool = False) -> Turn:
+        """Wait for a turn. Raises `Paced` where there is none within `WAIT_S`, unless `patient`."""
         if not self._shooting():
             return Turn()
         try:
-            async with asyncio.timeout(within_s):
+            async with asyncio.timeout(None if patient else WAIT_S):
                 await self._one.acquire()
                 try:
                     while self._shooting() and (rest := self._rested - time.monotonic()) > 0:

@@ -8,7 +8,7 @@ on there. Nothing that the service reports adds to it.
 A kill is modelled in this process: the wires of the dead service are cut, so that nothing it still
 sends arrives, the next service gets a copy of the root folder as it was then, and the bank's
 watchdog puts its lamps off. A power cut also takes back the names of files that were renamed last
-and not flushed. `tests/faults/test_restarts.py` kills real processes.
+and not flushed.
 """
 
 from __future__ import annotations
@@ -713,11 +713,6 @@ def run(
             derandomize=derandomize,
             deadline=None,
             database=None,
-            **(
-                {"verbosity": __import__("hypothesis").Verbosity.debug}
-                if os.environ.get("DBG")
-                else {}
-            ),
         ),
     )
     done: Counter[str] = machine.done
@@ -726,5 +721,14 @@ def run(
 
 def test_no_lamp_goes_on_without_permission(monkeypatch, tmp_path, wire, world):
     done = run(monkeypatch, tmp_path, wire, world, examples=40, steps=15, derandomize=True)
-    print(dict(done))
     assert done["steps"] >= 500
+    assert done["lights"] > 0
+
+
+@pytest.mark.slow
+def test_no_lamp_goes_on_without_permission_in_ten_thousand_steps(
+    monkeypatch, tmp_path, wire, world
+):
+    done = run(monkeypatch, tmp_path, wire, world, examples=420, steps=25, derandomize=False)
+    assert done["steps"] >= 10_000
+    assert done["lights"] > 0
