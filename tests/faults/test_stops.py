@@ -3,99 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
-import httpx
 import pytest
 from postgresql import Missing, PostgreSQL, running
-from waiting import machine_slack, until
+from waiting import until
 
 from simulators.peers.faults import Fault
-from stage_service.stopping import STOP_S
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 STANDING = ("-m", "benchmarks.service.standing_service")
 WRITE = "reconstruction.files.durable:_write"
 LIT = ("after stage_service.acquisition.exposing:Exposing._light", 6)
 SOFTWARE = {"plan": {"stepping": "software"}}
-
-
-class Process:
-    """`hairstage serve` or `worker` in a process of its own; `told` is what it has logged."""
-
-    def __init__(self, stack: ExitStack, log: Path, *words: object, **environment: str) -> None:
-        self._log = log
-        path = {"PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}"}
-        with log.open("w") as stderr:
-            self.process = subprocess.Popen(
-                [sys.executable, *map(str, words)],
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                text=True,
-                env={**os.environ, **path, **environment},
-            )
-        stack.callback(self._kill)
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, self.told
-        self.ready = json.loads(line)
-
-    @property
-    def told(self) -> str:
-        return self._log.read_text()
-
-    def stop(self) -> None:
-        self.process.send_signal(signal.SIGTERM)
-
-    def ended(self, code: int, *told: str) -> None:
-        """It ends within what a stop takes at most, with this exit status and these words last.
-
-        A machine on which it cannot even say that leaves the end to the kernel.
-        """
-        found = self.process.wait(STOP_S + 3.0 * machine_slack())
-        if found == -signal.SIGALRM and machine_slack() > 2:
-            return
-        assert found == code, self.told
-        for text in told:
-            assert re.search(text, self.told), self.told
-
-    def _kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as one:
-        yield one
-
-
-@pytest.fixture
-def serve(stack, tmp_path):
-    """`serve(rig_file, standing=(place, call), **environment)`: a service and its client."""
-
-    def start(rig_file, standing=None, **environment):
-        words = ["serve", "--json", "--no-auth", "--port", "0", "--rig", rig_file.path]
-        words += ["--devices", rig_file.path.with_suffix("") / "devices.toml"]
-        words += ["--root", tmp_path / "root"]
-        program = ("-m", "stage_service.cli")
-        if standing is not None:
-            program = (*STANDING, tmp_path, *standing)
-        service = Process(stack, tmp_path / "serve.log", *program, *words, **environment)
-        client = httpx.Client(base_url=service.ready["url"], timeout=60, trust_env=False)
-        return service, stack.enter_context(client)
-
-    return start
 
 
 @pytest.fixture
@@ -117,15 +38,14 @@ def is_lit(world) -> bool:
 
 
 def test_a_job_database_that_is_frozen_keeps_nobody_from_ending(
-    stage, serve, postgresql, stack, tmp_path
+    process, stage, serve, postgresql, stack, tmp_path
 ):
     """F15: its server takes connections and requests, and answers none."""
     rig_file, world = stage
     database = {"HAIRSTAGE_DATABASE_URL": postgresql.url}
     service, client = serve(rig_file, **database)
     assert client.get("/jobs").status_code == 200
-    worker = Process(
-        stack,
+    worker = process(
         tmp_path / "worker.log",
         *("-m", "stage_service.cli", "worker", "--json", "--root", tmp_path / "root"),
         **database,
@@ -141,8 +61,8 @@ def test_a_job_database_that_is_frozen_keeps_nobody_from_ending(
             service.stop()
             worker.stop()
             until(lambda: not is_lit(world))
-            for process in (service, worker):
-                process.ended(1, "after it was to stop; not ended: the job database")
+            for one in (service, worker):
+                one.ended(1, "after it was to stop; not ended: the job database")
     finally:
         postgresql.thaw()
     manifest = tmp_path / "root" / "captures" / capture / "manifest.json"
