@@ -166,6 +166,23 @@ def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatc
     assert (again.status_code, again.json().get("id")) == (202, job)
 
 
+def test_a_key_belongs_to_one_caller_and_one_request(rig_file, world, tmp_path):
+    """F17: another body, or another caller, got the first job without a word."""
+    tokens = Tokens(tmp_path / "tokens.json", "own")
+    eve = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'jobs'))}"}
+    with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
+        http.headers["Authorization"] = "Bearer own"
+        asked = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}, "model": "a"}
+        key = {"Idempotency-Key": "once"}
+        first = http.post("/jobs", json=asked, headers=key).json()["id"]
+        other = http.post("/jobs", json={**asked, "model": "b"}, headers=key)
+        assert (other.status_code, slug(other)) == (409, "key-used")
+        assert first in other.json()["detail"]
+        hers = http.post("/jobs", json={**asked, "model": "c"}, headers={**eve, **key})
+        assert hers.status_code == 202
+        assert hers.json()["id"] != first
+
+
 def test_who_may_remove(rig_file, world, tmp_path):
     tokens = Tokens(tmp_path / "tokens.json", "own")
     steers = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'steer'))}"}
