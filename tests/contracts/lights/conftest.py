@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import threading
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -239,12 +239,11 @@ def _own(lamps: int, stack: ExitStack, timeout_s: float) -> Bench:
     assert spec is not None
     assert spec.loader is not None
     peers = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = peers  # dataclasses look there
     spec.loader.exec_module(peers)
     assert lamps == peers.LAMPS
     world = peers.World()
-    server = peers.Server(("127.0.0.1", 0), peers.Lights)
-    server.world = world
-    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    server = peers.Server(world, peers.Lights)
     stack.callback(server.server_close)
     stack.callback(server.shutdown)
     config = ModbusTcpConfig(port=server.server_address[1], timeout_s=timeout_s)
