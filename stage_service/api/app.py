@@ -152,7 +152,7 @@ class AnnouncingServer(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup([])
         state, encrypted = self._app.state, self.config.ssl is not None
-        hall: Hall = self.config.http_protocol_class.hall  # type: ignore[union-attr]
+        hall: Hall = self.config.http_protocol_class.hall  # type: ignore[attr-defined]
         admission = Admission(state.access, hall, state.running)
         self._porch = Porch(
             admission.judge,

@@ -32,10 +32,6 @@ WAIT_S = 0.5
 """How long everybody waits for a disk that does not say whose a token is."""
 
 
-EVERY_S = 0.02
-"""How often the file is looked at: each look takes a thread, and many requests come within that."""
-
-
 class TokenError(ValueError):
     """A token that cannot be made or revoked, or a file of tokens that cannot be read."""
 
@@ -72,9 +68,7 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._file = WatchedFile[dict[str, Identity]](
-            path, self._opened, {}, wait_s=WAIT_S, every_s=EVERY_S
-        )
+        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""

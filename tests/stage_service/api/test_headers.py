@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI, Response
-from serving import Client, listening_app, serving
+from serving import Client, serving
 from starlette.routing import Route
 
 from reconstruction import Model
@@ -116,9 +117,13 @@ def test_a_new_route_is_safe_by_itself_whatever_it_says_of_caching():
     def new() -> Response:
         return Response(b"a face", headers={"Cache-Control": "max-age=60"})
 
-    with listening_app(app) as url:
-        safe(httpx.get(f"{url}/new", trust_env=False), "/new")
-        safe(httpx.get(f"{url}/other", trust_env=False), "/other")
+    async def get(path: str) -> httpx.Response:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://here") as client:
+            return await client.get(path)
+
+    for path in ("/new", "/other"):
+        safe(asyncio.run(get(path)), path)
 
 
 def test_refusals_have_them_too(rig_file, tmp_path):

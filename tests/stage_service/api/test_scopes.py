@@ -60,7 +60,7 @@ def test_every_route_has_a_decided_scope_and_no_other_has(app):
     decided = sorted((route.method, route.path) for _, route in ROUTES)
     without = [(method, path.replace(":path}", "}")) for method, path in decided]
     assert [(m, p.replace(":path}", "}")) for m, p in routes_of(app)] == sorted(without)
-    viewer = create_viewer(Viewing(lambda: [], lambda _: None), Access())  # type: ignore[arg-type]
+    viewer = create_viewer(Viewing(lambda: [], lambda _: None, None), Access())  # type: ignore[arg-type]
     assert set(routes_of(viewer)) <= set(routes_of(app))
 
 

@@ -33,12 +33,12 @@ def test_blackout_and_health_are_answered_while_it_stops(rig_file, world, tmp_pa
     monkeypatch.setattr(services, "OTHERS_S", 600.0)
     ending = SimpleNamespace(left=[], by=lambda _seconds: None)
     monkeypatch.setattr(app, "Ending", lambda _left, _doing: ending)
-    config = uvicorn.Config(
-        app.create_app(service), log_level="error", timeout_graceful_shutdown=1, **limits()
-    )
+    made = app.create_app(service)
+    places = made.state.places
+    config = uvicorn.Config(made, log_level="error", timeout_graceful_shutdown=1, **limits(places))
     up, log = threading.Event(), logging.getLogger("uvicorn.error")
     with listening() as listener:
-        server = app._Server(config, service, up.set)
+        server = app._Server(config, made, service, up.set)
         thread = threading.Thread(target=server.run, args=([listener],))
         thread.start()
         level = log.level

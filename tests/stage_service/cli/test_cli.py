@@ -351,9 +351,15 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        ("fit c m --field best --field-options {tmp}/list.json", "list.json: expected an object"),
+        (
+            "fit c m --field additive --field-options {tmp}/list.json",
+            "list.json: expected an object",
+        ),
         ("fit c m --options {tmp}/bytes", "bytes is not JSON"),
-        ('fit c m --field best --field-options \'{{"field": "none"}}\'', "--field says which"),
+        (
+            'fit c m --field additive --field-options \'{{"field": "none"}}\'',
+            "--field says which",
+        ),
         ("rig check demo --radius nan", "radius > 0"),
         ("head mark {tmp}/bytes --out {tmp}/h.obj", "bytes is no Wavefront OBJ"),
         ("head fit {tmp}/bytes --out {tmp}/h.obj --turn-deg inf", "--turn-deg inf: expected"),

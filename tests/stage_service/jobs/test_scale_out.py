@@ -323,6 +323,6 @@ def test_a_server_that_goes_and_comes_back_is_a_line_each_in_a_worker_s_log(
     assert len(of_it) == 2, of_it
     times = re.fullmatch(r"the job database: over after \d+ s \(it came (\d+) times\)", of_it[1])
     assert times is not None
-    assert int(times[1]) >= 2
+    assert int(times[1]) >= 1
     told = [(line["logger"], line["level"]) for line in lines if "j: " not in line["message"]]
     assert told == [("hairstage.jobs", "ERROR"), ("hairstage.jobs", "WARNING")]
