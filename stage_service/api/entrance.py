@@ -97,8 +97,8 @@ class Entrance:
             await held.wait("requests")
             await held.turn()
         if not upload and (wrong := bodies.not_json(headers, body)) is not None:
-            told = [{"loc": "", "msg": wrong}]
-            return problem_response(scope["path"], "invalid-request", wrong, errors=told)
+            errors = [{"loc": "", "msg": wrong}]
+            return problem_response(scope["path"], "invalid-request", wrong, errors=errors)
         await self._app(scope, bodies.again(body, receive), held.sending(send))
         return None
 

@@ -39,7 +39,7 @@ FEW = 50
 class Feed:
     """The events as bytes, for many listeners on one event loop; no thread waits for any.
 
-    What has happened is told to all of them at once, in rounds: those who may steer have rounds of
+    What has happened is sent to all of them at once, in rounds: those who may steer have rounds of
     their own. Who stands at the same event as another is given the same bytes.
     """
 
@@ -60,26 +60,26 @@ class Feed:
             self._events.tell(self._happened)
         rounds = self._rounds[steers]
         if not rounds.listeners:
-            rounds.told = self._events.last
+            rounds.sent = self._events.last
         rounds.listeners += 1
         try:
             yield
         finally:
             rounds.listeners -= 1
 
-    def untold(self, number: int, steers: bool) -> int:
-        """How many events after that one may be told now."""
-        return self._rounds[steers].told - number
+    def pending(self, number: int, steers: bool) -> int:
+        """How many events after that one may be sent now."""
+        return self._rounds[steers].sent - number
 
     async def after(self, number: int, within_s: float, steers: bool) -> tuple[int, bytes]:
         """The number of the last event of those after `number` that come within this time, and
         their text; `number` and nothing where none comes."""
         rounds = self._rounds[steers]
-        if rounds.told <= number:
+        if rounds.sent <= number:
             with suppress(TimeoutError):
                 async with asyncio.timeout(within_s):
                     await rounds.news.wait()
-        if rounds.told <= number:
+        if rounds.sent <= number:
             return number, b""
         if number not in self._made:
             if len(self._made) >= MOST_PLACES:
@@ -109,12 +109,12 @@ class Feed:
 
 
 class _Rounds:
-    """When some of the listeners are told, and up to which event."""
+    """When some of the listeners are sent events, and up to which."""
 
     def __init__(self, events: EventLog, made: dict[int, tuple[int, bytes]], pace_s: float) -> None:
         self._events, self._made, self._pace_s = events, made, pace_s
         self.listeners = 0
-        self.told, self._told_at, self._due = 0, 0.0, False
+        self.sent, self._sent_at, self._due = 0, 0.0, False
         self.news = asyncio.Event()
 
     @property
@@ -127,12 +127,12 @@ class _Rounds:
         if self.idle:
             self._due = True
             loop = asyncio.get_running_loop()
-            soonest = self._told_at + self._pace_s * self.listeners
+            soonest = self._sent_at + self._pace_s * self.listeners
             loop.call_at(max(loop.time(), soonest), self._tell)
 
     def _tell(self) -> None:
         self._due = False  # first: what happens from here on is for the next round
-        self.told, self._told_at = self._events.last, asyncio.get_running_loop().time()
+        self.sent, self._sent_at = self._events.last, asyncio.get_running_loop().time()
         self._made.clear()
         news, self.news = self.news, asyncio.Event()
         news.set()
@@ -184,7 +184,7 @@ async def _follow(request: Request, number: int) -> AsyncIterator[bytes]:
         while _may(request):
             looked = clock()
             while (left := looked + LOOK_S - clock()) > 0:
-                much = not owner.steers and feed.untold(number, owner.steers) > FEW
+                much = not owner.steers and feed.pending(number, owner.steers) > FEW
                 turn = await pace.turn(patient=True) if much else Turn()
                 try:
                     number, text = await feed.after(number, left, owner.steers)

@@ -193,9 +193,8 @@ def test_while_a_capture_is_shot_work_of_others_is_done_one_piece_after_the_othe
         first.end()
         first.end()  # once
         monkeypatch.setattr(pace, "SHARE", 1e-6)
-        (
-            await found.turn(patient=True)
-        ).end()  # what it took is rested for, a million times as long
+        # What it took is rested for, a million times as long.
+        (await found.turn(patient=True)).end()
         with pytest.raises(Paced):
             await found.turn()
         running[0] = False
