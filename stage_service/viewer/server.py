@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import sys
 import threading
@@ -23,7 +22,6 @@ MOST_REQUEST = 1 << 20
 def main(control: socket.socket) -> None:
     """Serve the calls that come over `control`, until that is closed."""
     os.nice(LOWEST)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     with suppress(OSError):  # when memory runs out, this goes first
         Path("/proc/self/oom_score_adj").write_text("1000")
     kept = Kept(Source.open)

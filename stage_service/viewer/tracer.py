@@ -16,11 +16,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from reconstruction import CaptureError, ModelError
 from stage_service.decoding import framing
+from stage_service.signals import tied
 from stage_service.viewer.operations import Source
 from stage_service.viewer.viewed import BadLight, NothingToView
 
@@ -55,6 +57,7 @@ class Tracer:
         self._control: socket.socket | None = None
         self._calls: dict[socket.socket, bool] = {}
         self._stopped_since: float | None = None
+        self._starter = ThreadPoolExecutor(1, "tracer-starter")
         self._watching = self._closed = False
 
     def do(self, source: Source, operation: str, options: dict[str, Any], *, yields: bool) -> Any:
@@ -88,6 +91,7 @@ class Tracer:
         with self._lock:
             self._closed = True
             self._end()
+        self._starter.shutdown(wait=False)
 
     @property
     def pid(self) -> int | None:
@@ -152,18 +156,18 @@ class Tracer:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             module = [sys.executable, "-m", "stage_service.viewer.server"]
-            # A process group of its own in the service's session: one that is stopped and left
-            # behind is woken and ended by the kernel (SIGHUP, SIGCONT), and priority counts.
-            self._control, self._process = (
-                ours,
-                subprocess.Popen(
-                    [*module, str(theirs.fileno())],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno()],
-                    process_group=0,
-                ),
+            # The kernel kills it when the thread that started it ends, even where it is stopped:
+            # one thread that lives as long as the service. A group of its own keeps the
+            # terminal's signals away; a session of its own would void its priority.
+            start = self._starter.submit(
+                subprocess.Popen,
+                tied([*module, str(theirs.fileno())], "KILL"),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                process_group=0,
             )
+            self._control, self._process = ours, start.result()
         ours.settimeout(START_S)
         if not ours.recv(16):
             raise BrokenPipeError("it ended before it was ready")
