@@ -146,7 +146,7 @@ class Service:
 
     def _read(self, status: CaptureStatus) -> None:
         if status.outcome == "completed":
-            self._follower.owe(status, fresh=False)
+            self._follower.follow_up(status, fresh=False)
 
     def _all_read(self) -> None:
         known = self._captures.list()
@@ -300,7 +300,7 @@ class Service:
         return CaptureView(**status.model_dump(), job=self._follower.job_after(status.id))
 
     def _completed(self, status: CaptureStatus) -> None:
-        self._follower.owe(status)
+        self._follower.follow_up(status)
 
     def frame(self, capture_id: str, step: int, camera: str, read: Callable[[Path], T]) -> T:
         """What `read` makes of a frame's EXR file, wherever compression has just put it.
@@ -363,9 +363,9 @@ class Service:
         """Put a capture into the trash. Raises as `Storage.remove_capture`, and `BadInput` for a
         snapshot."""
         check_kept(capture_id)
-        owes = self._follower.owes
+        pending = self._follower.is_pending
         with self.jobs.lock:
-            removed = self.storage.remove_capture(capture_id, owes, by, dry_run=dry_run)
+            removed = self.storage.remove_capture(capture_id, pending, by, dry_run=dry_run)
         if not dry_run:
             self._verifier.forget(capture_id)
         return removed

@@ -111,9 +111,9 @@ class Storage:
         return path
 
     def remove_capture(
-        self, capture: str, owed: Callable[[str], bool], by: Caller, *, dry_run: bool
+        self, capture: str, pending: Callable[[str], bool], by: Caller, *, dry_run: bool
     ) -> Removed:
-        """Put a capture into the trash, or say what would go there. `owed` says whether its job is
+        """Put a capture into the trash, or say what would go there. `pending` says whether its job is
         still to be enqueued. Raises `UnknownCapture`, `WrongState` while it is shot, `JournalInUse`
         while it is written or compressed, `InUse`, `Forbidden`, `JobsUnavailable`."""
         status = self._captures.get(capture)
@@ -122,7 +122,7 @@ class Storage:
         whole = path if path.is_symlink() else path.resolve()  # a link's jobs are another's
         made = [j for j in self._all_jobs() if Path(j.capture) == whole]
         busy = next((j.id for j in made if j.state != "done"), None)
-        if busy is not None or owed(capture):
+        if busy is not None or pending(capture):
             raise InUse(f"capture {capture}: job {busy or 'to follow'} needs it: wait, or cancel")
         models = sorted({Path(j.model).name for j in made if Path(j.model).is_dir()})
         found = self._removal("capture", capture, path, by).model_copy(update={"models": models})

@@ -11,10 +11,10 @@ from typing import Any
 
 from reconstruction.files.durable import RESERVE
 from stage_service.captures.manager import CaptureManager
-from stage_service.devices.last_seen import LastSeen
+from stage_service.devices.cached_status import CachedStatus
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue
-from stage_service.jobs.slots import workers_seen
+from stage_service.jobs.slots import worker_statuses
 
 LONGEST_LOOK_S = 0.5
 """How long a request waits for a disk that is slow to say how it is."""
@@ -54,7 +54,7 @@ class Watching:
         self.root, self.captures, self.queue, self.follower = root, captures, queue, follower
         self._started = time.time()
         unseen: dict[str, Any] = {"free": None, "workers": [], "gone": None}
-        self._disk = LastSeen(self._look, unseen, LONGEST_LOOK_S)
+        self._disk = CachedStatus(self._look, unseen, LONGEST_LOOK_S)
 
     def disk(self) -> tuple[int | None, bool]:
         """What the disk of the root folder has left, None where it does not answer; and whether it
@@ -119,7 +119,7 @@ class Watching:
         except OSError as error:
             gone = f"{self.captures.folder}: {error.strerror}: is its disk there?"
             return {"free": None, "workers": [], "gone": gone}
-        return {"free": free, "workers": workers_seen(self.root), "gone": None}
+        return {"free": free, "workers": worker_statuses(self.root), "gone": None}
 
 
 _COUNTED = {

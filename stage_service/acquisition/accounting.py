@@ -68,16 +68,16 @@ class FrameAccount:
         if left:
             raise self._stray(f"{left} behind block id {block_id}")
 
-    def timed(self, timestamp: float, asked: float, answered: float) -> None:
+    def timed(self, timestamp: float, requested: float, replied: float) -> None:
         """Check that the frame was made by the newest pulse, which fired between the two times.
 
         How far the host's clock is ahead of the camera's is bounded by each frame; a frame of an
         earlier pulse contradicts the others, because each pulse is asked for after the last was
         answered. Raises `IndexShift`.
         """
-        low, high = asked - timestamp, answered - timestamp
+        low, high = requested - timestamp, replied - timestamp
         if self._ahead is not None:
-            slack = CLOCK_DRIFT * max(0.0, asked - self._timed_at)
+            slack = CLOCK_DRIFT * max(0.0, requested - self._timed_at)
             low = max(low, self._ahead[0] - slack)
             high = min(high, self._ahead[1] + slack)
         if low > high:
@@ -85,7 +85,7 @@ class FrameAccount:
             received = f"one made {low - high:.4g} s or more before or after it"
             todo = "Something else fired the camera, or a frame came late: check the trigger cable."
             raise IndexShift(self.device, doing, expected, received, todo)
-        self._ahead, self._timed_at = (low, high), asked
+        self._ahead, self._timed_at = (low, high), requested
 
     def late(self, block_id: int) -> None:
         """A frame of a pulse that counted as unanswered. Raises `IndexShift` when it cannot be."""

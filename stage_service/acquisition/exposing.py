@@ -20,8 +20,8 @@ class Pulse:
     """The trigger box's count, and the monotonic seconds between which it fired."""
 
     count: int
-    asked: float
-    answered: float
+    requested: float
+    replied: float
 
 
 class Exposing:
@@ -60,9 +60,9 @@ class Exposing:
         with timings.on("settle"):
             self._sleep(self._devices.config.lights.settle_s)
         with timings.on("trigger"):
-            asked = time.monotonic()
+            requested = time.monotonic()
             count = self._devices.trigger.pulse(step.exposure)
-            pulse = Pulse(count, asked, time.monotonic())
+            pulse = Pulse(count, requested, time.monotonic())
         # From the box's answer, which never comes before the pulse: the light stays long enough.
         with timings.on("exposure"):
             self._sleep(step.exposure)

@@ -37,7 +37,7 @@ class Shots:
 
 
 class HardwareRun:
-    """One run on an armed stage; `shoot` blocks, `stop_asked` is looked at while it runs.
+    """One run on an armed stage; `shoot` blocks, `stop_requested` is looked at while it runs.
 
     `schedule` has the seconds from the first pulse at which each step's pulse is due; `steady` says
     that nothing but the box decides on them.
@@ -64,7 +64,7 @@ class HardwareRun:
         self.schedule = list(accumulate((r.period_s for r in each[:-1]), initial=0.0))
 
     def shoot(
-        self, cameras: FanOut, cancel: threading.Event, stop_asked: Callable[[], bool]
+        self, cameras: FanOut, cancel: threading.Event, stop_requested: Callable[[], bool]
     ) -> Shots:
         """Run the table and collect what the cameras make of it.
 
@@ -83,7 +83,7 @@ class HardwareRun:
             assert beams is not None
             beams.load_sequence(shown)
         trigger.load_table(self._rows, self._devices.config.watchdog_s)
-        watch = _Watch(self._devices, stop_asked)
+        watch = _Watch(self._devices, stop_requested)
         if cancel.is_set():
             raise Cancelled("the capture is being stopped")
         try:
@@ -171,10 +171,10 @@ _TODO = {
 class _Watch:
     """Asks the box how far it is, which feeds its watchdog, until the table is over."""
 
-    def __init__(self, devices: DeviceSet, stop_asked: Callable[[], bool]) -> None:
+    def __init__(self, devices: DeviceSet, stop_requested: Callable[[], bool]) -> None:
         self.over = threading.Event()
         self._progress: TableProgress | None = None
-        self._trigger, self._stop_asked = devices.trigger, stop_asked
+        self._trigger, self._stop_asked = devices.trigger, stop_requested
         self._error: Exception | None = None
         self._leave = threading.Event()
         self._thread = threading.Thread(target=self._run, name="table-watch", daemon=True)

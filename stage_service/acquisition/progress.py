@@ -12,7 +12,7 @@ from reconstruction import Step
 from reconstruction.capture.folder import StepKind
 from stage_service.acquisition.states import Progress
 
-TELL_S = 0.2
+NOTIFY_S = 0.2
 """From one time that progress is told to the next, at least: who looks must not slow the run."""
 MEASURED = 25
 """The newest steps of a kind tell how long the next ones take."""
@@ -20,7 +20,7 @@ ENOUGH = 3
 """So many steps must have been measured."""
 
 
-class Pace:
+class StepDurations:
     """Seconds that a step of each kind took, at the median of the newest: one that is slow because
     a camera warms up, or was shot again, says nothing of the rest."""
 
@@ -47,7 +47,7 @@ class RunProgress:
     """One run over `steps`; `frames` are those of each camera that were there before it.
 
     Cameras' threads may say that a frame has arrived; all else is one thread's. `tell` hears of
-    it, at most every `TELL_S` seconds.
+    it, at most every `NOTIFY_S` seconds.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class RunProgress:
         self._todo = Counter(step.kind for step in steps)
         self._lock = threading.RLock()
         self._frames = dict(frames)
-        self._pace = Pace()
+        self._durations = StepDurations()
         self._done = 0
         self._step: Step | None = None
         self._here = 0
@@ -97,7 +97,7 @@ class RunProgress:
         """This step is over."""
         with self._lock:
             if self._step is step:
-                self._pace.took([step], self._clock() - self._began)
+                self._durations.took([step], self._clock() - self._began)
             self._count(step)
             self._here = 0
         self._say()
@@ -121,7 +121,7 @@ class RunProgress:
         """It is over; so many frames of each camera are good."""
         with self._lock:
             if self._live:
-                self._pace.took(self._run[: self._live], self._clock() - self._began)
+                self._durations.took(self._run[: self._live], self._clock() - self._began)
             for camera, n in kept.items():
                 self._frames[camera] += n
             self._run, self._came = (), dict.fromkeys(self._frames, 0)
@@ -150,10 +150,10 @@ class RunProgress:
     def _left(self, live: int) -> float | None:
         todo = self._todo.copy()
         if live < 2:
-            return self._pace.left(todo)
+            return self._durations.left(todo)
         each = (self._clock() - self._first_at) / (live - 1)  # without what the first waited for
         todo.subtract(step.kind for step in self._run)
-        others = self._pace.left(todo)
+        others = self._durations.left(todo)
         rest = each * todo.total() if others is None else others
         return each * (len(self._run) - live) + rest
 
@@ -169,7 +169,7 @@ class RunProgress:
     def _say(self) -> None:
         with self._lock:
             now = self._clock()
-            if now - self._told_at < TELL_S:
+            if now - self._told_at < NOTIFY_S:
                 return
             progress = self.now()
             if progress == self._told:

@@ -29,7 +29,7 @@ from stage_service.plan.resolved import ResolvedPlan
 from stage_service.plan.stepping import SHORTEST_RUN
 
 Notify = Callable[[str, dict[str, Any]], None]
-ORDERLY_S = 0.5
+OWN_BLACKOUT_S = 0.5
 """How long whoever darkens a run waits for it to do so itself."""
 WHILE_PAUSED = "Remove the cause first: until then resuming fails the capture; its frames are kept."
 MAY_BE_ANOTHER = "the camera held a frame too many: this one may have been another step's"
@@ -173,15 +173,14 @@ class Sequencer:
     def darken(self, within_s: float) -> Blackout:
         """Stop at once and put everything off, whatever the run's thread is stuck in.
 
-        Returns the blackout with which the run ends in order, or else one of the caller's own,
-        after which the run lights nothing any more. Where the run's own was over before, it says
-        nothing of now: the caller's is made, on links that are opened anew. Takes `ORDERLY_S` +
-        `within_s` seconds at most; off is sent before a lamp is waited for that the run is just
-        putting on.
+        Returns the run's own final blackout if that ends within `OWN_BLACKOUT_S`; otherwise, or if
+        the run had ended before this call, the result of a new one on reopened links. Takes at
+        most `OWN_BLACKOUT_S + within_s` seconds. Off is sent before this waits for a command that
+        is under way.
         """
         over = self._dark.is_set()
         self.stop_now()
-        if not over and self._dark.wait(ORDERLY_S) and self.blackout is not None:
+        if not over and self._dark.wait(OWN_BLACKOUT_S) and self.blackout is not None:
             return self.blackout
         deadline = time.monotonic() + within_s
         blackout(self.devices, attempts=1, within_s=0.0)  # what hears it goes dark now
@@ -390,7 +389,7 @@ class Sequencer:
         else:
             account.arrived(frame.block_id, frame.left)
             if camera.capabilities.timestamps and frame.timestamp:
-                account.timed(frame.timestamp, pulse.asked, pulse.answered)
+                account.timed(frame.timestamp, pulse.requested, pulse.replied)
 
     def _arm(self, exposure: float, cameras: FanOut) -> None:
         """Arm every camera; all have confirmed when this returns. What a queue still holds is

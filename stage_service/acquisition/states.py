@@ -45,7 +45,7 @@ def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
     return {} if state == "done" and outcome in ("completed", "damaged") else TRANSITIONS[state]
 
 
-ASKED = {"abort": "abort", "pause": "pause", "resume": "resume", "continue": "resume"}
+REQUESTABLE = {"abort": "abort", "pause": "pause", "resume": "resume", "continue": "resume"}
 """The actions that are for a person to ask for, and by which word; all others are the run's own."""
 
 
@@ -53,7 +53,9 @@ class WrongState(RuntimeError):
     """The state does not allow the action; the message lists what can be asked for."""
 
     def __init__(self, action: str, state: State, outcome: Outcome | None = None) -> None:
-        allowed = ", ".join(sorted(ASKED[a] for a in possible(state, outcome) if a in ASKED))
+        allowed = ", ".join(
+            sorted(REQUESTABLE[a] for a in possible(state, outcome) if a in REQUESTABLE)
+        )
         known = f"{state} ({outcome})" if state == "done" and outcome else state
         told = f"cannot {action} a capture that is {known}; possible now: {allowed or 'nothing'}"
         super().__init__(told)

@@ -57,7 +57,7 @@ class Feed:
         """Count a listener for as long as the block."""
         if self._loop is None:
             self._loop = asyncio.get_running_loop()
-            self._events.tell(self._happened)
+            self._events.subscribe(self._happened)
         rounds = self._rounds[steers]
         if not rounds.listeners:
             rounds.sent = self._events.last

@@ -49,7 +49,7 @@ class Caller:
     token: str | None = None
     name: str = ""
     scopes: tuple[Scope, ...] = SCOPES
-    asked: Moment | None = None
+    moment: Moment | None = None
 
     def require(self, scope: Scope) -> None:
         """Raise `Forbidden` without this scope."""
@@ -127,7 +127,7 @@ class Control:
         """The caller's word for light. Raises `Forbidden` for arming without the scope "arm"."""
         if armed_by is not None:
             by.require("arm")
-        return Word(way, by.token, armed_by, self._who(by), by.asked)
+        return Word(way, by.token, armed_by, self._who(by), by.moment)
 
     def _record(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""

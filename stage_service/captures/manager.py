@@ -51,7 +51,7 @@ TIDY_S = 1.0
 """How long a blackout, once it is dark, waits for the capture's folder to be finished."""
 GIVEN_UP_S = 5.0
 """A blackout is over within this time, or three times the slowest timeout_s of the devices."""
-TOLD_S = 1.0
+LATE_AFTER_S = 1.0
 """What has not been read back dark by then is told as unknown, before the blackout is answered."""
 UNREAD = "a blackout is under way: not every lamp and projector has been read back dark yet"
 
@@ -392,7 +392,7 @@ class CaptureManager:
         is how old the answer is. "safety" has the state after the last blackout, and whether it is
         latched. "since_start" counts what a device did to captures since the service started:
         "faults" and "timeouts" ended one; a camera "missed" frames, and was "late" with some."""
-        seen = self.stage.asked()
+        seen = self.stage.query()
         cameras = seen.pop("cameras", {})
         with self._lock:
 
@@ -439,7 +439,7 @@ class CaptureManager:
 
         Returns {"safe": bool, "state": "dark" | "unknown, unsafe", "detail": str}; what is unknown
         is to be treated as lit. Waits for no disk, no camera and nobody who asks the devices. Until
-        it is over `safety` says "unknown, unsafe", and after `TOLD_S` an event does.
+        it is over `safety` says "unknown, unsafe", and after `LATE_AFTER_S` an event does.
         """
         devices = self.stage.devices
         with self._lock:
@@ -447,7 +447,9 @@ class CaptureManager:
             self._unread += 1
             run = self._running
             self._revoke("the stage was put dark")
-        late = threading.Timer(TOLD_S, lambda: self.events.publish("stage.lamps", self.safety()))
+        late = threading.Timer(
+            LATE_AFTER_S, lambda: self.events.publish("stage.lamps", self.safety())
+        )
         late.daemon = True
         try:
             with suppress(RuntimeError):  # no thread can be had: the answer tells

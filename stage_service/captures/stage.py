@@ -12,8 +12,8 @@ from typing import Any
 from stage_service.acquisition.safety import Blackout, blackout
 from stage_service.captures.latch import Latch
 from stage_service.config import RigFile
+from stage_service.devices.cached_status import CachedStatus
 from stage_service.devices.device_set import DeviceSet
-from stage_service.devices.last_seen import LastSeen
 from stage_service.devices.ownership import Ownership, StageInUse
 from stage_service.records.audit import SERVICE, AuditLog
 from stage_service.records.events import EventLog
@@ -169,7 +169,7 @@ class Stage:
         """Whether a blackout, or somebody's look, came to what a capture may begin after."""
         return self._last is not None and not self._last.blocks
 
-    def asked(self) -> dict[str, Any]:
+    def query(self) -> dict[str, Any]:
         """What the devices say, with its age; they are asked anew, but not waited for."""
         return self._seen.get() if self.there else {"age_s": None}
 
@@ -182,8 +182,8 @@ class Stage:
         return {k: v["state"] for k, v in named.items() if isinstance(v, dict) and "state" in v}
 
     @cached_property
-    def _seen(self) -> LastSeen:
-        return LastSeen(self._look, self.devices.unseen())
+    def _seen(self) -> CachedStatus:
+        return CachedStatus(self._look, self.devices.unseen())
 
     def _look(self) -> dict[str, Any] | None:
         """Ask the devices; without a capture, connect for the answer, until one begins."""

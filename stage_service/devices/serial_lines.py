@@ -76,16 +76,16 @@ class SerialLines:
                 self._port.close()
             self._port = None
 
-    def ask(self, request: str, reply: str, doing: str) -> re.Match[str]:
+    def request(self, request: str, reply: str, doing: str) -> re.Match[str]:
         """Send `request` and return the match of the reply, whose groups are its places.
 
         `reply` is a text with places in it: `<n>` a number, `<word>` small letters and hyphens,
         `<text>` anything, `<a|b>` one of these. Raises `DeviceError`: `SafetyRefusal` for the
         device's error 3.
         """
-        return self._ask(request, _pattern(reply), reply, doing)
+        return self._exchange(request, _pattern(reply), reply, doing)
 
-    def _ask(self, request: str, pattern: str, reply: str, doing: str) -> re.Match[str]:
+    def _exchange(self, request: str, pattern: str, reply: str, doing: str) -> re.Match[str]:
         with self._lock:
             if self._port is None:
                 self.connect()
@@ -107,8 +107,8 @@ class SerialLines:
         raise self._error(DeviceError, doing, expected, repr(line), todo)
 
     def echo(self, request: str, doing: str) -> None:
-        """`ask` for what the device does and repeats."""
-        self._ask(request, re.escape(f"OK {request}"), f"OK {request}", doing)
+        """`request` for what the device does and repeats."""
+        self._exchange(request, re.escape(f"OK {request}"), f"OK {request}", doing)
 
     def set_watchdog(self, seconds: float) -> None:
         """Set the device's watchdog; raises `ValueError` beyond what devices take."""
@@ -133,9 +133,9 @@ class SerialLines:
         self.echo(f"{begin} {len(texts)}", f"beginning a {whole}")
         for i, text in enumerate(texts):
             doing = f"uploading {each.lower()} {i} of the {whole}"
-            self.ask(f"{each} {i} {text}", f"OK {each} {i}", doing)
+            self.request(f"{each} {i} {text}", f"OK {each} {i}", doing)
         crc = zlib.crc32("".join(f"{text}\n" for text in texts).encode("ascii"))
-        self.ask("ARM", f"OK ARM {steps} {crc:08x}", f"arming the {whole}")
+        self.request("ARM", f"OK ARM {steps} {crc:08x}", f"arming the {whole}")
 
     def _identify(self) -> re.Match[str]:
         doing, seen = "identifying", ""
@@ -221,7 +221,7 @@ class SerialLines:
 
 
 def _pattern(reply: str) -> str:
-    """A reply with places, as `SerialLines.ask` has it, as a pattern."""
+    """A reply with places, as `SerialLines.request` has it, as a pattern."""
     parts = re.split("<([^>]*)>", reply)
     return "".join(
         _PLACES.get(part, f"({part})") if number % 2 else re.escape(part)

@@ -47,7 +47,9 @@ class JobFollower:
         self.waiting: Waiting | None = None
         self.waiting_at = 0.0
         self._lock = threading.Lock()
-        self._owed: dict[str, _Wish] = {}  # by capture; whether its job is there is not known yet
+        self._pending: dict[
+            str, _Wish
+        ] = {}  # by capture; whether its job is there is not known yet
         self._certain: set[str] = set()  # captures whose job is there
         self._wake = threading.Event()
         self._closed = False
@@ -66,7 +68,7 @@ class JobFollower:
         if self._thread.is_alive():
             self._thread.join(timeout=5)
 
-    def owe(self, status: CaptureStatus, *, fresh: bool = True) -> None:
+    def follow_up(self, status: CaptureStatus, *, fresh: bool = True) -> None:
         """Take note of a capture that completed. One that is not `fresh` may have its job."""
         asked = status.request.get("pipeline")
         if asked is None:
@@ -76,23 +78,23 @@ class JobFollower:
         except ValidationError as error:  # a capture of another version must not stop this one
             log.warning("%s: its pipeline cannot be run: %s", status.path, error)
             return
-        self._owed[status.id] = _Wish(pipeline, Path(status.path), fresh)
+        self._pending[status.id] = _Wish(pipeline, Path(status.path), fresh)
         self._wake.set()
 
-    def owes(self, capture: str) -> bool:
+    def is_pending(self, capture: str) -> bool:
         """Whether the capture's job is still to be enqueued."""
-        return capture in self._owed
+        return capture in self._pending
 
     def job_after(self, capture: str) -> str | None:
         """The id of the job that follows the capture, there already or about to be."""
-        there = capture in self._certain or capture in self._owed
+        there = capture in self._certain or capture in self._pending
         return job_of(capture) if there else None
 
     def enqueue_now(self, job: str) -> Job | None:
         """The job that is still owed under this id. Raises `JobsUnavailable`."""
         capture = job.removeprefix(job_of(""))
         with self._lock:
-            wish = self._owed.get(capture)
+            wish = self._pending.get(capture)
             return None if wish is None else self._enqueue(capture, wish)
 
     def _run(self) -> None:
@@ -102,7 +104,7 @@ class JobFollower:
             if self._closed:
                 return
             try:
-                self._enqueue_what_is_owed()
+                self._enqueue_pending()
                 self._tell()
                 if time.monotonic() - self.waiting_at > COUNT_S:
                     self.waiting, self.waiting_at = self._queue.waiting(), time.monotonic()
@@ -112,19 +114,19 @@ class JobFollower:
             except Exception as error:  # the thread goes on
                 CAUSES.failed(log, FOLLOWING, error, error)
 
-    def _enqueue_what_is_owed(self) -> None:
-        if not self._owed:
+    def _enqueue_pending(self) -> None:
+        if not self._pending:
             return
         there = self._queue.ids()
         with self._lock:
-            for capture, wish in list(self._owed.items()):
+            for capture, wish in list(self._pending.items()):
                 begun = (self._root / "models" / capture).exists()
                 if job_of(capture) in there:
                     self._certain.add(capture)
-                    del self._owed[capture]
+                    del self._pending[capture]
                 elif begun and not wish.fresh:
                     log.warning("%s: its job is lost; the model stays as it is", wish.capture)
-                    del self._owed[capture]
+                    del self._pending[capture]
                 else:
                     self._enqueue(capture, wish)
 
@@ -133,7 +135,7 @@ class JobFollower:
         model = Model(self._root / "models" / capture)
         job = self._queue.submit(wish.pipeline, wish.capture, model, job=job_of(capture))
         self._certain.add(capture)
-        self._owed.pop(capture, None)
+        self._pending.pop(capture, None)
         self._audit.record(SERVICE, "job.submit", job.id, detail=f"{job.pipeline} on {capture}")
         return job
 

@@ -167,8 +167,8 @@ class JobQueue:
         """Put a job on the queue; where there is a job of this id already, return that one."""
         spec = {
             "pipeline": request.name,
-            "capture": self._told(capture),
-            "model": self._told(model.path),
+            "capture": self._stored(capture),
+            "model": self._stored(model.path),
             "options": request.options.to_dict(),
             "retries": request.retries,
         }
@@ -232,7 +232,7 @@ class JobQueue:
 
     def at_work_on(self, model: Model) -> str | None:
         """The id of a job, queued or running, that makes this model."""
-        path = self._told(model.path)
+        path = self._stored(model.path)
         with self._database() as client:
             for state in ("PENDING", "ENQUEUED", "DELAYED"):
                 for found in client.list_workflows(name=WORKFLOW, status=state):
@@ -254,11 +254,11 @@ class JobQueue:
             found = client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
         return bool(found) and found[0].status == "CANCELLED"
 
-    def path(self, told: str) -> Path:
+    def path(self, stored: str) -> Path:
         """Where a capture or model of a job lies on this machine."""
-        return self._root.resolve() / told
+        return self._root.resolve() / stored
 
-    def _told(self, path: Path) -> str:
+    def _stored(self, path: Path) -> str:
         """A path as jobs keep it: inside the root, relative to it, wherever that is mounted."""
         path, root = path.resolve(), self._root.resolve()
         return str(path.relative_to(root) if path.is_relative_to(root) else path)

@@ -88,7 +88,7 @@ class WorkerSlot:
 
 
 @dataclass(frozen=True)
-class WorkerSeen:
+class WorkerStatus:
     """A worker of this root: `age_s` since it last said that it is there."""
 
     host: str
@@ -97,7 +97,7 @@ class WorkerSeen:
     age_s: float
 
 
-def workers_seen(root: Path) -> list[WorkerSeen]:
+def worker_statuses(root: Path) -> list[WorkerStatus]:
     """Every worker that this root has had, on whatever machine."""
     found = []
     for path in sorted(root.glob("worker-*.lock")):
@@ -111,7 +111,7 @@ def workers_seen(root: Path) -> list[WorkerSeen]:
                 alive = file is None
                 if file is not None:
                     file.close()
-        found.append(WorkerSeen(host, name, alive, age))
+        found.append(WorkerStatus(host, name, alive, age))
     return found
 
 

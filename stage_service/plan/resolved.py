@@ -20,7 +20,7 @@ from stage_service.plan.stepping import LATENCY_S, Run, limited_by, runs, second
 from stage_service.plan.steps import expand, exposures_of, no_controller, rows_of, swept
 from stage_service.plan.timeline import timeline
 
-MOST_TOLD = 20
+MOST_LISTED = 20
 """So many wrong names are told one by one."""
 
 
@@ -181,5 +181,5 @@ def _unknown(kind: str, chosen: Literal["all"] | tuple[str, ...], known: list[st
     ]
     twice = sorted(name for name, count in Counter(chosen).items() if count > 1)
     problems += [f"{kind}s: {name!r} is listed twice" for name in twice]
-    more = len(problems) - MOST_TOLD
-    return problems[:MOST_TOLD] + ([f"{kind}s: {more} more such names"] if more > 0 else [])
+    more = len(problems) - MOST_LISTED
+    return problems[:MOST_LISTED] + ([f"{kind}s: {more} more such names"] if more > 0 else [])

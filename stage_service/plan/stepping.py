@@ -29,7 +29,7 @@ class Run:
 
 
 def runs(
-    steps: tuple[Step, ...], rig_file: RigFile, asked: Literal["auto", "software", "hardware"]
+    steps: tuple[Step, ...], rig_file: RigFile, requested: Literal["auto", "software", "hardware"]
 ) -> tuple[tuple[Run, ...], str]:
     """Divide the steps of a plan into runs, and say why they are clocked as they are.
 
@@ -39,7 +39,7 @@ def runs(
     """
     devices = rig_file.devices
     why = ""
-    if asked == "software":
+    if requested == "software":
         why = "the plan asks for it"
     elif devices is None or not devices.hardware_stepping:
         why = "the rig file does not say that the trigger box's gates are wired (hardware_stepping)"

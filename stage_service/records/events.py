@@ -29,11 +29,11 @@ class EventLog:
         self._events: deque[Event] = deque(maxlen=capacity)
         self._changed = threading.Condition()
         self._last = 0
-        self._told: list[Callable[[], object]] = []
+        self._listeners: list[Callable[[], object]] = []
 
-    def tell(self, told: Callable[[], object]) -> None:
-        """Have `told` called after each event, by whoever published it: it must not wait."""
-        self._told.append(told)
+    def subscribe(self, listener: Callable[[], object]) -> None:
+        """Have `listener` called after each event, by whoever published it: it must not wait."""
+        self._listeners.append(listener)
 
     @property
     def last(self) -> int:
@@ -48,8 +48,8 @@ class EventLog:
             event = Event(self._last, kind, utc_now(), data)
             self._events.append(event)
             self._changed.notify_all()
-        for told in self._told:
-            told()
+        for listener in self._listeners:
+            listener()
         return event
 
     def wait(self, number: int, timeout: float) -> list[Event]:

@@ -15,8 +15,8 @@ from typing import Any
 
 from reconstruction.containment import plain_file
 from stage_service.background import beside
+from stage_service.records.polled_file import PolledFile
 from stage_service.records.tokens import write_secret
-from stage_service.records.watched import WatchedFile
 
 log = logging.getLogger("hairstage.logins")
 KEY_FILE = "login.key"
@@ -45,7 +45,7 @@ class SigningKey:
         self._stored = path is None
         self._storing: Future[None] | None = None
         self._lock = threading.Lock()
-        self._file: WatchedFile[bytes] | None = None
+        self._file: PolledFile[bytes] | None = None
         if path is None:
             return
         try:
@@ -55,7 +55,7 @@ class SigningKey:
         except (OSError, ValueError) as error:
             log.warning("%s: logins and blackout rights begin anew: %s", path, error)
             self._store()
-        self._file = WatchedFile(path, self._newest, self._key, wait_s=0.0, every_s=LOOK_S)
+        self._file = PolledFile(path, self._newest, self._key, wait_s=0.0, every_s=LOOK_S)
 
     def sign(self, purpose: str, data: dict[str, Any]) -> str:
         """`data` as a text of URL-safe characters, which `verify` takes for this purpose alone."""

@@ -21,7 +21,7 @@ from reconstruction.capture.writer import utc_now
 from reconstruction.containment import is_file_name, plain_file
 from reconstruction.files.durable import flush, writing
 from reconstruction.reading import read_json
-from stage_service.records.watched import WatchedFile
+from stage_service.records.polled_file import PolledFile
 
 Scope = Literal["read", "steer", "arm", "jobs", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
@@ -68,7 +68,7 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._file = WatchedFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
+        self._file = PolledFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
 
     def find(self, token: str) -> Identity | None:
         """Whose token this is."""

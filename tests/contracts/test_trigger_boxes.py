@@ -114,7 +114,7 @@ def test_it_counts_its_pulses(any_box):
     assert driver.count() == 0
     assert driver.status() == TriggerStatus(interlock_open=False, estop_pressed=False)
     with pytest.raises(DeviceError, match="ERR 1 unknown command"):
-        driver._lines.ask("FIRE", "OK", "firing")
+        driver._lines.request("FIRE", "OK", "firing")
 
 
 @pytest.mark.parametrize("exposure", [0.0, -1.0, 4e-7, 10.001, math.nan, math.inf])
@@ -327,7 +327,7 @@ def test_rows_alike_are_joined_and_more_than_fit_are_refused(box):
 )
 def test_bad_requests_are_refused_in_one_line(box, line, code):
     with pytest.raises(DeviceError, match=f"'ERR {code} "):
-        box.driver._lines.ask(line, "OK", "trying")
+        box.driver._lines.request(line, "OK", "trying")
     assert box.driver.progress().state == "idle"
 
 
@@ -346,7 +346,7 @@ def test_bad_requests_are_refused_in_one_line(box, line, code):
     ],
 )
 def test_bad_rows_are_refused_and_the_table_can_go_on(box, row, code):
-    ask = box.driver._lines.ask
+    ask = box.driver._lines.request
     ask("TABLE 1", "OK TABLE 1", "beginning")
     with pytest.raises(DeviceError, match=f"'ERR {code} "):
         ask(row, "OK", "trying")

@@ -46,7 +46,7 @@ class ModbusLightBank:
     """Implements `LightBank`; see there for the contract.
 
     After any trouble the link is closed. The next request opens it anew, drains it and identifies
-    the bank before anything else is asked, so that no late answer is taken for a later one's.
+    the bank before anything else is sent, so that no late answer is taken for a later one's.
     Raises `RigError` where registers lie over each other.
     """
 
@@ -349,22 +349,22 @@ class ModbusLightBank:
         """One request: `payload` is the count of a read, else what is written, a number alone for
         "write_register". Returns the right answer, without its frame."""
         assert self._link is not None
-        asked = frames.request(method, address, payload)
+        sent = frames.request(method, address, payload)
         try:
-            answer = self._link.ask(asked)
+            answer = self._link.exchange(sent)
         except (Unanswered, OSError) as error:
             raise self._unanswered(doing, error) from error
         except NotTheAnswer as other:
             raise self._other_answer(
-                doing, f"{frames.expected(asked)}, {other.expected}", other
+                doing, f"{frames.expected(sent)}, {other.expected}", other
             ) from other
-        if answer[0] == asked[0] | frames.EXCEPTION and len(answer) == frames.EXCEPTION_SIZE:
+        if answer[0] == sent[0] | frames.EXCEPTION and len(answer) == frames.EXCEPTION_SIZE:
             code = answer[1]
             received = f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})"
             todo = "Check the registers in [devices.lights]; 4 also says that a sequence is armed."
             raise self._error(doing, "an answer", received, todo)
-        if not frames.is_right(asked, answer):
-            raise self._other_answer(doing, frames.expected(asked), frames.shown(answer))
+        if not frames.is_right(sent, answer):
+            raise self._other_answer(doing, frames.expected(sent), frames.shown(answer))
         return answer
 
     def _unanswered(self, doing: str, error: Unanswered | OSError) -> DeviceError:

@@ -38,21 +38,21 @@ def request(method: str, address: int, payload: int | Sequence[int]) -> bytes:
     return struct.pack(">BHHB", code, address, len(payload), len(data)) + data
 
 
-def right_size(asked: bytes) -> int:
+def right_size(sent: bytes) -> int:
     """How many bytes the right answer to a request has, without its frame."""
-    code, count = asked[0], int.from_bytes(asked[3:5], "big")
+    code, count = sent[0], int.from_bytes(sent[3:5], "big")
     if code not in _READS:
         return _WRITTEN_SIZE
     return 2 + (-(-count // 8) if code == 1 else 2 * count)
 
 
-def is_right(asked: bytes, answer: bytes) -> bool:
+def is_right(sent: bytes, answer: bytes) -> bool:
     """Whether an answer is one to this request; its exception is none."""
-    if len(answer) != right_size(asked) or answer[0] != asked[0]:
+    if len(answer) != right_size(sent) or answer[0] != sent[0]:
         return False
-    if asked[0] in _READS:
+    if sent[0] in _READS:
         return answer[1] == len(answer) - 2
-    return answer == asked[:_WRITTEN_SIZE]
+    return answer == sent[:_WRITTEN_SIZE]
 
 
 def registers(answer: bytes) -> list[int]:
@@ -65,11 +65,11 @@ def bits(answer: bytes, count: int) -> list[bool]:
     return [bool(answer[2 + i // 8] >> i % 8 & 1) for i in range(count)]
 
 
-def expected(asked: bytes) -> str:
+def expected(sent: bytes) -> str:
     """What the right answer to a request is, as `shown` has it."""
-    code, address, number = struct.unpack(">BHH", asked[:5])
+    code, address, number = struct.unpack(">BHH", sent[:5])
     if code in _READS:
-        return _shown_read(code, right_size(asked) - 2)
+        return _shown_read(code, right_size(sent) - 2)
     return _shown_write(code, address, number)
 
 

@@ -68,7 +68,7 @@ class ModbusLink(ABC):
     echoes: bool | None = None
 
     @abstractmethod
-    def ask(self, request: bytes) -> bytes:
+    def exchange(self, request: bytes) -> bytes:
         """The answer to a request, both without frames: a right one, an exception, or one of
         another function or content. Raises `Unanswered`, `NotTheAnswer`, `OSError`."""
 
@@ -98,7 +98,7 @@ class TcpLink(ModbusLink):
     def drain(self, quiet_s: float) -> None:
         """A new connection carries nothing old."""
 
-    def ask(self, request: bytes) -> bytes:
+    def exchange(self, request: bytes) -> bytes:
         config = self._config
         self._transaction = self._transaction % 0xFFFF + 1
         deadline = time.monotonic() + config.timeout_s
@@ -161,7 +161,7 @@ class RtuLink(ModbusLink):
             if not self._more(quiet_s):
                 return
 
-    def ask(self, request: bytes) -> bytes:
+    def exchange(self, request: bytes) -> bytes:
         config = self._config
         sent = frames.with_crc(bytes([config.unit]) + request)
         time.sleep(max(0.0, self._quiet_since + silence_s(config) - time.monotonic()))

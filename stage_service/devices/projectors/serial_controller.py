@@ -60,7 +60,7 @@ class SerialProjectorController:
         self._lines.echo("OFF", "putting the projectors dark")
 
     def is_dark(self) -> bool:
-        return self._lines.ask("SHOW?", "SHOW <text>", "reading what is shown")[1] == "OFF"
+        return self._lines.request("SHOW?", "SHOW <text>", "reading what is shown")[1] == "OFF"
 
     def load_sequence(self, patterns: Sequence[Pattern]) -> None:
         """Upload in runs of rows, compare checksum and number of patterns with our own, and leave
@@ -73,7 +73,7 @@ class SerialProjectorController:
     def position(self) -> int:
         """How often the gate has closed since the sequence was armed."""
         doing = "reading the sequence's position"
-        match = self._lines.ask("SEQ?", "SEQ <armed|idle|watchdog> <n>", doing)
+        match = self._lines.request("SEQ?", "SEQ <armed|idle|watchdog> <n>", doing)
         if match[1] != "armed":
             tripped = match[1] == "watchdog"
             received = f"{match[1]}, after {match[2]} patterns"
@@ -91,7 +91,7 @@ class SerialProjectorController:
 
     def heartbeat(self) -> None:
         """Any request counts; this one changes nothing."""
-        self._lines.ask("SHOW?", "SHOW <text>", "feeding the watchdog")
+        self._lines.request("SHOW?", "SHOW <text>", "feeding the watchdog")
 
 
 def _runs(patterns: Sequence[Pattern]) -> list[list[Pattern]]:

@@ -47,17 +47,17 @@ class SerialTriggerBox:
     def pulse(self, exposure_s: float) -> int:
         """Fire all cameras once for 1 µs to 10 s; returns the count."""
         us = self._microseconds("exposure", exposure_s, 1)
-        return int(self._lines.ask(f"PULSE {us}", "OK <n>", "firing the cameras")[1])
+        return int(self._lines.request(f"PULSE {us}", "OK <n>", "firing the cameras")[1])
 
     def count(self) -> int:
-        return int(self._lines.ask("COUNT?", "COUNT <n>", "reading the pulse count")[1])
+        return int(self._lines.request("COUNT?", "COUNT <n>", "reading the pulse count")[1])
 
     def reset(self) -> None:
-        self._lines.ask("RESET", "OK 0", "resetting the pulse count")
+        self._lines.request("RESET", "OK 0", "resetting the pulse count")
 
     def status(self) -> TriggerStatus:
         reply = "STATUS interlock=<0|1> estop=<0|1>"
-        match = self._lines.ask("STATUS?", reply, "reading the safety inputs")
+        match = self._lines.request("STATUS?", reply, "reading the safety inputs")
         return TriggerStatus(match[1] == "1", match[2] == "1")
 
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
@@ -79,12 +79,12 @@ class SerialTriggerBox:
 
     def progress(self) -> TableProgress:
         reply = f"SEQ <{'|'.join(get_args(TableState))}> <n> <n> <word>"
-        match = self._lines.ask("SEQ?", reply, "reading the table's progress")
+        match = self._lines.request("SEQ?", reply, "reading the table's progress")
         # The pattern admits these states only.
         return TableProgress(cast("TableState", match[1]), int(match[2]), int(match[3]), match[4])
 
     def stop(self) -> int:
-        return int(self._lines.ask("STOP", "OK STOP <n>", "stopping the table")[1])
+        return int(self._lines.request("STOP", "OK STOP <n>", "stopping the table")[1])
 
     def _text(self, row: TableRow) -> str:
         if row.gates not in get_args(Gates):

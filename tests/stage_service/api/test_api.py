@@ -164,7 +164,7 @@ def test_a_plan_is_expanded_once_for_a_capture(http, monkeypatch):
 
 
 def test_a_job_that_is_about_to_be_enqueued_can_be_cancelled(http, server, head, monkeypatch):
-    monkeypatch.setattr(server.service._follower, "_enqueue_what_is_owed", lambda: None)
+    monkeypatch.setattr(server.service._follower, "_enqueue_pending", lambda: None)
     body = {"plan": SHORT, "pipeline": {"name": "reconstruct"}, "head": head}
     job = capture_done(http, body)["job"]
     cancelled = http.delete(f"/jobs/{job}")

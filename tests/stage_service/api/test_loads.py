@@ -134,7 +134,7 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
         world.show = "ON 65535"
         with stuck_lights(world):
             flood(http, "GET", "/devices", count=5)
-            monkeypatch.setattr(manager_module, "TOLD_S", 0.0)
+            monkeypatch.setattr(manager_module, "LATE_AFTER_S", 0.0)
             flood(http, "POST", "/devices/blackout", count=1)
             until(lambda: http.get("/health").json()["lamps"] == "unknown, unsafe")
             events = http.service.events.after

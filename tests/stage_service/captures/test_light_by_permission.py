@@ -270,7 +270,7 @@ class Stage(RuleBasedStateMachine):
         return self.service._captures
 
     def by(self, person: str) -> Caller:
-        return Caller(person, self.tokens[person], person, asked=self.service.moment())
+        return Caller(person, self.tokens[person], person, moment=self.service.moment())
 
     def withdraw(self) -> None:
         """Nothing is permitted from here on, and what was read is no longer the newest."""

@@ -189,9 +189,9 @@ def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_pat
     monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", "postgresql://nobody@127.0.0.1:1/nothing")
     queue = JobQueue(tmp_path)
     follower = JobFollower(tmp_path, queue, EventLog(), AuditLog(tmp_path / "audit.jsonl"))
-    follower.owe(completed(tmp_path, "fresh"))
-    follower.owe(completed(tmp_path, "lost"), fresh=False)
-    follower.owe(completed(tmp_path, "made"), fresh=False)
+    follower.follow_up(completed(tmp_path, "fresh"))
+    follower.follow_up(completed(tmp_path, "lost"), fresh=False)
+    follower.follow_up(completed(tmp_path, "made"), fresh=False)
     Model(tmp_path / "models" / "made").create()
     follower.start()
     try:

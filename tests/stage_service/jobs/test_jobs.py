@@ -16,7 +16,7 @@ from reconstruction import Model
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, read_progress
 from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
-from stage_service.jobs.slots import WorkerSlot, workers_seen
+from stage_service.jobs.slots import WorkerSlot, worker_statuses
 
 WORKER = Path(__file__).with_name("job_worker.py")
 
@@ -45,7 +45,7 @@ def queue(tmp_path: Path) -> Iterator[JobQueue]:
 
 
 def worker_is_alive(root: Path) -> bool:
-    return any(worker.alive for worker in workers_seen(root))
+    return any(worker.alive for worker in worker_statuses(root))
 
 
 def submit(queue: JobQueue, root: Path, pipeline: str = "reconstruct") -> Job:

@@ -20,7 +20,7 @@ from reconstruction import Model
 from stage_service.jobs import slots
 from stage_service.jobs.queue import JobQueue, NoSuchJob, database_url
 from stage_service.jobs.records import PipelineRequest
-from stage_service.jobs.slots import Namespace, WorkerSlot, hold_dead, workers_seen
+from stage_service.jobs.slots import Namespace, WorkerSlot, hold_dead, worker_statuses
 
 WORKER = Path(__file__).with_name("job_worker.py")
 
@@ -169,12 +169,12 @@ def test_a_dead_workers_job_is_taken_up_by_another_of_its_machine(tmp_path):
         until(lambda: log.exists() and "slow begins" in log.read_text())
         second = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert second.stdout.readline() == "worker-1\n"
-        assert [w.alive for w in workers_seen(tmp_path)] == [True, True]
+        assert [w.alive for w in worker_statuses(tmp_path)] == [True, True]
         end(first)
         until(lambda: log.read_text().count("slow begins") == 2)
         (Path(job.model) / "go").touch()
         until(lambda: queue.get("j").outcome == "succeeded", pause=0.02)
-        assert [w.alive for w in workers_seen(tmp_path)] == [False, True]
+        assert [w.alive for w in worker_statuses(tmp_path)] == [False, True]
     finally:
         for worker in filter(None, (first, second)):
             end(worker)
@@ -257,10 +257,10 @@ def test_the_worker_of_another_machine_is_not_dead_because_its_lock_is_free(tmp_
     monkeypatch.setattr(slots, "HOST", "another")
     here.release()
     assert hold_dead(tmp_path, executor) is None
-    (seen,) = workers_seen(tmp_path)
+    (seen,) = worker_statuses(tmp_path)
     assert (seen.name, seen.alive) == ("worker-0", True)  # until it has been silent for long
     os.utime(next(tmp_path.glob("worker-*.lock")), (0, 0))
-    assert not workers_seen(tmp_path)[0].alive
+    assert not worker_statuses(tmp_path)[0].alive
 
 
 def test_a_server_is_given_limits_that_its_url_does_not_set(tmp_path, monkeypatch):

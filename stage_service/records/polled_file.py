@@ -16,7 +16,7 @@ Version = tuple[int, int, int] | None
 """Inode, time of the last change (ns) and size of a file; None: there is none."""
 
 
-class WatchedFile(Generic[T]):
+class PolledFile(Generic[T]):
     """What `read()` returns, called again on a thread of its own once `path` has changed.
 
     `value` waits at most `wait_s` seconds for the disk, and returns the last value meanwhile. It

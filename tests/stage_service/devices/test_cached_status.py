@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 
-from stage_service.devices.last_seen import LastSeen
+from stage_service.devices.cached_status import CachedStatus
 
 
 def test_who_found_no_thread_to_look_with_looks_the_next_time(monkeypatch):
     def none_left(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    seen = LastSeen(lambda: {"free": 5}, {"free": None})
+    seen = CachedStatus(lambda: {"free": 5}, {"free": None})
     with monkeypatch.context() as full:
         full.setattr(threading.Thread, "start", none_left)
         assert seen.get() == {"free": None, "age_s": None}

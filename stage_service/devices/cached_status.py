@@ -12,7 +12,7 @@ WAIT_S = 2.0
 """How long somebody who asks waits for an answer that is under way."""
 
 
-class LastSeen:
+class CachedStatus:
     """Asks one at a time, on a thread of its own, however many want to know.
 
     `look()` returns what it saw, or None where it gave up; before the first look it is `unseen`.
