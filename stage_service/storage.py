@@ -113,7 +113,7 @@ class Storage:
     def remove_capture(
         self, capture: str, pending: Callable[[str], bool], by: Caller, *, dry_run: bool
     ) -> Removed:
-        """Put a capture into the trash, or say what would go there. `pending` says whether its job is
+        """Move a capture into the trash, or list what would move. `pending(capture)`: its job is
         still to be enqueued. Raises `UnknownCapture`, `WrongState` while it is shot, `JournalInUse`
         while it is written or compressed, `InUse`, `Forbidden`, `JobsUnavailable`."""
         status = self._captures.get(capture)

@@ -53,11 +53,10 @@ class WrongState(RuntimeError):
     """The state does not allow the action; the message lists what can be asked for."""
 
     def __init__(self, action: str, state: State, outcome: Outcome | None = None) -> None:
-        allowed = ", ".join(
-            sorted(REQUESTABLE[a] for a in possible(state, outcome) if a in REQUESTABLE)
-        )
+        verbs = (REQUESTABLE[a] for a in possible(state, outcome) if a in REQUESTABLE)
+        allowed = ", ".join(sorted(verbs)) or "nothing"
         known = f"{state} ({outcome})" if state == "done" and outcome else state
-        told = f"cannot {action} a capture that is {known}; possible now: {allowed or 'nothing'}"
+        told = f"cannot {action} a capture that is {known}; possible now: {allowed}"
         super().__init__(told)
         self.action, self.state = action, state
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -447,9 +448,8 @@ class CaptureManager:
             self._unread += 1
             run = self._running
             self._revoke("the stage was put dark")
-        late = threading.Timer(
-            LATE_AFTER_S, lambda: self.events.publish("stage.lamps", self.safety())
-        )
+        publish = partial(self.events.publish, "stage.lamps")
+        late = threading.Timer(LATE_AFTER_S, lambda: publish(self.safety()))
         late.daemon = True
         try:
             with suppress(RuntimeError):  # no thread can be had: the answer tells

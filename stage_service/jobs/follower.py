@@ -47,9 +47,7 @@ class JobFollower:
         self.waiting: Waiting | None = None
         self.waiting_at = 0.0
         self._lock = threading.Lock()
-        self._pending: dict[
-            str, _Wish
-        ] = {}  # by capture; whether its job is there is not known yet
+        self._pending: dict[str, _Wish] = {}  # by capture: its job may not exist yet
         self._certain: set[str] = set()  # captures whose job is there
         self._wake = threading.Event()
         self._closed = False
