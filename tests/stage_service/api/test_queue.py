@@ -16,6 +16,7 @@ from stage_service.captures import capture_queue
 from stage_service.captures.manager import CaptureManager
 from stage_service.captures.may_light import NotNow, Word
 from stage_service.cli import main
+from stage_service.cli.support.client import ServiceClient
 from stage_service.config import SafetyLimits
 from stage_service.plan.capture_plan import CapturePlan
 
@@ -297,3 +298,18 @@ def test_the_command_line_queues(http, tmp_path, capsys):
     assert [e["state"] for e in run("history")["history"]] == ["started", "removed"]
     assert run("go-on")["held"] is None
     ended(http, 1)
+
+
+def test_the_command_line_releases_no_hold_that_it_has_not_shown(http, capsys, monkeypatch):
+    """A blackout comes between its reading and its word: exit status, reason and the next step."""
+    get = ServiceClient.get
+
+    def late(service: ServiceClient, path: str) -> Any:
+        found = get(service, path)
+        assert http.post("/devices/blackout").status_code == 200
+        return found
+
+    monkeypatch.setattr(ServiceClient, "get", late)
+    assert main(["queue", "go-on", "--url", str(http.base_url)]) != 0
+    assert "blackout by" in capsys.readouterr().err
+    assert "blackout by" in http.get("/queue").json()["held"]

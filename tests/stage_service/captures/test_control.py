@@ -10,7 +10,7 @@ import pytest
 
 from stage_service.acquisition.safety import Blackout
 from stage_service.captures.latch import CannotAcknowledge, Latch, Unsafe
-from stage_service.records.audit import AuditLog
+from stage_service.records.audit import AuditLog, NotRecorded
 from stage_service.records.lease import Leased, Leases, NoLease, RootInUse, RootLock
 
 DARK = Blackout(True, "dark")
@@ -50,6 +50,60 @@ def test_a_lease_ends_by_itself_and_is_renewed_from_now(tmp_path):
     assert leases.holder(second.token) == "Eve"
     leases.release(second.token)
     leases.check(None)
+
+
+def test_a_lease_is_on_the_disk_before_it_counts_and_counts_after_a_restart(tmp_path):
+    path, clock, wall = tmp_path / "lease.json", Clock(), Clock()
+    wall.now = 1e9
+    token = Leases(path, clock, wall).take("Ada", 3600).token
+    clock.now, wall.now = 0.0, wall.now + 1800  # another boot, half an hour later
+    again = Leases(path, clock, wall)
+    again.check(token)
+    with pytest.raises(Leased, match="Ada"):
+        again.check(None)
+    clock.now = 1799.0
+    assert again.current is not None
+    clock.now = 1800.0
+    assert again.current is None
+    assert token not in path.read_text()
+
+
+def test_a_clock_that_was_set_back_lengthens_no_lease(tmp_path):
+    path, clock, wall = tmp_path / "lease.json", Clock(), Clock()
+    wall.now = 1e9
+    Leases(path, clock, wall).take("Ada", 60)
+    wall.now -= 1e8
+    again = Leases(path, clock, wall)
+    assert again.current is not None
+    clock.now = 60.0
+    assert again.current is None
+
+
+def test_a_lease_that_cannot_be_written_is_not_granted(tmp_path):
+    leases = Leases(tmp_path / "missing" / "lease.json")
+    with pytest.raises(NotRecorded, match="the lease could not be written"):
+        leases.take("Ada", 60)
+    assert leases.current is None
+
+
+@pytest.mark.parametrize(
+    "left",
+    ["", "{", '{"holder": "Ada"}', '{"holder": "A", "digest": "-", "seconds": NaN, "ends": 1}'],
+)
+def test_a_damaged_lease_is_anybodys_for_a_day_and_an_admin_ends_it(tmp_path, left):
+    path, clock, wall = tmp_path / "lease.json", Clock(), Clock()
+    wall.now = 1e9
+    path.write_text(left)
+    leases = Leases(path, clock, wall)
+    with pytest.raises(Leased, match="somebody unknown"):
+        leases.check("any token")
+    wall.now += 43200  # a restart begins no new day
+    clock.now += 43200
+    again = Leases(path, clock, wall)
+    clock.now += 43200
+    assert again.current is None
+    Leases(path, clock, wall).end()
+    assert Leases(path, clock, wall).current is None
 
 
 def test_two_services_never_share_a_root(tmp_path):
