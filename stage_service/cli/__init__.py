@@ -1,7 +1,6 @@
-"""The command line: `hairstage COMMAND`, each in the file of its name, but `import` in `verify.py`,
-`token` in `tokens.py`, `serve`, `worker` and `simulate` in `processes.py`: in `stage/` those that
-run a stage, in `model/` those that work on a model, here all others. They import what they need
-when they run."""
+"""The command line `hairstage COMMAND`, a file for each command; `import` is in `verify.py`,
+`serve`, `worker` and `simulate` are in `stage/processes.py`. Commands import their libraries when
+they run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bench`: runs the benchmarks of a checkout, which are no part of the installed package."""
+"""`bench`: runs the benchmarks of a checkout; the installed package has none."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from stage_service.cli.support.commands import FAILED, CommandError, Commands, O
 from stage_service.signals import tied
 
 BENCHMARKS = {
-    "acquisition": "steps and bytes a second beside what wires and disk allow",
+    "acquisition": "steps and bytes a second compared with the limits of wires and disk",
     "agreement": "a capture that Blender Cycles rendered, from its true strands",
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
-    "backends": "BSDF, OLAT, stage 1 and line stereo on CPU and GPU: seconds, agreement",
-    "bsdf": "our hair BSDF beside Mitsuba's: tables and pictures",
+    "backends": "BSDF, OLAT, inverse rendering and line stereo on CPU and GPU: seconds, agreement",
+    "bsdf": "our hair BSDF compared with Mitsuba's: tables and images",
     "callers": "load x caller x fault: seconds to a blackout, how much slower a capture is",
     "captures": "10,000 captures in a root: the service's start, and a page of them",
-    "console": "a capture and an idle service, beside three open pages, streams of events, nobody",
-    "demo": "the demo over subjects and seeds beside its baselines, from runs that were made",
-    "exports": "a model opened, rendered and written by Blender, beside ours",
-    "fields": "fields of reflectance beside baselines on new lights and views",
-    "frames": "the simulators' frames beside many paths: error against run time",
+    "console": "a capture and an idle service with three open pages, event streams, none",
+    "demo": "recorded demos over subjects and seeds compared with their baselines",
+    "exports": "a model opened, rendered and written by Blender, compared with ours",
+    "fields": "fields of reflectance compared with baselines on new lights and views",
+    "frames": "the simulators' frames compared with many paths: error against run time",
     "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
-    "large": "captures of 1.3 and 20 megapixels: seconds and memory beside their estimate",
+    "large": "captures of 1.3 and 20 megapixels: seconds and memory compared with the estimate",
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
-    "light_planes": "strands of three subjects, still and drifting, beside baselines",
-    "masks": "automatic hair masks beside true ones, at several path counts",
-    "renderers": "our renderers beside Mitsuba's path integrator, light by light and line by line",
+    "light_planes": "strands of three subjects, still and drifting, compared with baselines",
+    "masks": "automatic hair masks compared with true ones, at several path counts",
+    "renderers": "our renderers compared with Mitsuba's path integrator, per light and scanline",
     "soak": "a service that shoots for an hour and is killed: memory, frames, blackouts",
-    "viewer": "the viewer's light beside the path tracer's; frames a second, and its shader's cost",
+    "viewer": "the viewer compared with the path tracer; frames a second; cost of its shader",
     "all": "every one of them",
 }
-"""What each is about, for `python -m benchmarks` and its help too."""
+"""What each measures; `python -m benchmarks` prints it too."""
 
 
 def add(commands: Commands) -> None:
@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
     bench = commands.add_parser(
         "bench",
         help="measure error against run time (in a checkout)",
-        description="Run a benchmark of the checkout; what follows NAME is its own.",
+        description="Run a benchmark of the checkout; arguments after NAME go to it.",
         epilog="\n".join(f"  {name:<14}{text}" for name, text in BENCHMARKS.items()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -61,7 +61,7 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
             "'make bench', or 'hairstage bench NAME' of an editable installation, in a checkout",
             FAILED,
         )
-    # tests/ has folders of the packages' names: the packages come first, wherever this is run.
+    # tests/ has folders with the packages' names, so the packages come first
     path = os.pathsep.join(
         [str(tests.parent), str(tests), *filter(None, [os.environ.get("PYTHONPATH")])]
     )

@@ -1,4 +1,4 @@
-"""`calibrate`: a rig file from captures of a board and of spheres, and the board to print."""
+"""`calibrate`: a rig file from captures of a board and of spheres; the board to print."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ def add(commands: Commands) -> None:
     """Add the commands."""
     group = add_group(commands, "calibrate", "calibrate a stage")
     rig = add_command(group, "rig", run_rig)
-    rig.add_argument("boards", type=Path, nargs="+", metavar="CAPTURE", help="board, one a pose")
+    rig.add_argument(
+        "boards",
+        type=Path,
+        nargs="+",
+        metavar="CAPTURE",
+        help="captures of the board, one per pose",
+    )
     rig.add_argument(
         "--rig", type=rig_path, help="the nominal rig file (default: the first capture's)"
     )
@@ -32,9 +38,11 @@ def add(commands: Commands) -> None:
     rig.add_argument("--diffuse-radius-mm", type=float, default=50.0)
     rig.add_argument("--diffuse-albedo", type=float, default=0.8, help="scales all lights")
     rig.add_argument(
-        "--paper-albedo", type=float, help="of the board; without it projectors stay as strong"
+        "--paper-albedo",
+        type=float,
+        help="albedo of the board; without it projector intensities stay nominal",
     )
-    rig.add_argument("--keep-lens", action="store_true", help="K and distortion stay nominal")
+    rig.add_argument("--keep-lens", action="store_true", help="keep the nominal K and distortion")
     rig.add_argument("--truth", type=rig_path, help="a rig file to compare with")
     _board_options(rig)
 
@@ -60,12 +68,12 @@ def _board(args: argparse.Namespace) -> Any:
 
 
 def run_rig(args: argparse.Namespace, output: Output) -> None:
-    """A rig file from captures of a board and of spheres.
+    """Calibrate a rig file from captures of a board and of spheres.
 
-    Calibrate cameras (and, where the captures hold sweeps, projectors) from captures of a ChArUco
-    board, one a pose, and lights from captures of a mirror or diffuse sphere, one a place. Writes a
-    rig file with the nominal one's device tables, and beside it NAME.report.json: what is known how
-    well, and what no capture determined.
+    Cameras (and projectors, if the captures have sweeps) are calibrated from captures of a ChArUco
+    board, one per pose, lights from captures of a mirror or diffuse sphere, one per place. Writes a
+    rig file with the nominal device tables, and NAME.report.json with deviations and undetermined
+    parameters.
     """
     from reconstruction import Capture, Rig
     from reconstruction.calibration.rig_comparison import compare_rigs
@@ -76,7 +84,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
     if args.out.suffix != ".json":
         raise BadArgument(f"--out must end in .json, got {args.out}")
     truth = None if args.truth is None else Rig.load(args.truth)
-    args.out.parent.mkdir(parents=True, exist_ok=True)  # not after all of the work
+    args.out.parent.mkdir(parents=True, exist_ok=True)  # fail before the work
     boards = [Capture(p) for p in args.boards]
     tables: dict[str, Any] = {}
     if args.rig is None:
@@ -91,7 +99,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
         }
     if truth is not None:
         try:
-            compare_rigs(nominal, truth)  # what it lacks is told before the work
+            compare_rigs(nominal, truth)  # fail before the work
         except KeyError as error:
             raise BadArgument(f"--truth {args.truth}: {error.args[0]}") from error
     targets = Targets(
@@ -127,7 +135,7 @@ def run_rig(args: argparse.Namespace, output: Output) -> None:
 
 
 def run_board(args: argparse.Namespace, output: Output) -> None:
-    """The board as a picture to print."""
+    """Write the board as an image to print."""
     import cv2
 
     board = _board(args)
@@ -135,9 +143,9 @@ def run_board(args: argparse.Namespace, output: Output) -> None:
         raise BadArgument(f"{args.out}: expected a file ending in .png")
     wide = board.square / 0.0254 * args.dpi
     if not 8 <= wide <= 8192:
-        raise BadArgument(f"--dpi {args.dpi}: squares of 8 to 8192 pixels are drawn, not {wide:g}")
+        raise BadArgument(f"--dpi {args.dpi}: expected squares of 8 to 8192 pixels, got {wide:g}")
     if not cv2.imwrite(str(args.out), board.picture(round(wide))):
-        raise BadArgument(f"{args.out}: cannot be written: is its folder there?")
+        raise BadArgument(f"{args.out}: cannot be written: check that its folder exists")
     width, height = (1e3 * board.size).tolist()
     output.result(
         {"picture": str(args.out), "width_mm": width, "height_mm": height},

@@ -1,5 +1,4 @@
-"""`hairstage demo`: the whole product once, with a simulated rig: three processes, one capture,
-one job, one table."""
+"""`hairstage demo`: one capture and one job on a simulated rig, in three processes."""
 
 from __future__ import annotations
 
@@ -29,10 +28,10 @@ if TYPE_CHECKING:
 
 MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
-"""One of so many lights is held out: a dozen of 331. Of few lights, four are."""
+"""One light of so many is held out: a dozen of 331. Of few lights, four are."""
 
 TURNING_FRAMES = 36
-"""Of the animation that the demo ends with: under a minute of one core, however many they are."""
+"""Frames of the animation at the end."""
 
 FILES = (
     "index.html",
@@ -43,16 +42,14 @@ FILES = (
     "report.json",
 )
 READY_S = 300.0
-"""Seconds until a process of the demo must be ready: a busy machine takes its time."""
+"""Deadline for a process of the demo to become ready."""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     demo = add_command(commands, "demo", run_demo)
     add_subject(demo)
-    demo.add_argument(
-        "--out", type=Path, default=Path("runs/demo"), help="folder, made where there is none"
-    )
+    demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="output folder")
     demo.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
     demo.add_argument("--hold-out-camera", metavar="CAMERA", help="default: the rig's last camera")
 
@@ -60,15 +57,15 @@ def add(commands: Commands) -> None:
 def run_demo(args: argparse.Namespace, output: Output) -> None:
     """Capture, reconstruct, fit and relight a simulated subject.
 
-    Start a simulated rig, the service and a worker; make one capture through the REST API, follow
-    its job, which judges the result against the truth, and print the figures. Everything is left in
-    OUT; an earlier demo's results there are replaced.
+    Start a simulated rig, the service and a worker; make one capture through the REST API and
+    follow its job, which scores the result against the truth. Results go to OUT; those of an
+    earlier demo there are replaced.
     """
     from reconstruction import Model, Rig
     from reconstruction.array_backend import chosen_variant
+    from stage_service.cli.demo_screen import last_screen
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
-    from stage_service.cli.support.tables import figures_table
 
     exit_on_sigterm()
     begin = time.perf_counter()
@@ -76,7 +73,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))
     rig = Rig.load(args.rig)
     held_out = hold_out(rig, args.hold_out_camera)
-    chosen_variant()  # what is missing is told before anything is started
+    chosen_variant()  # fail before a process is started
     _check(args)
     _prepare(out)
 
@@ -112,7 +109,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
         },
     }
     (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
-    output.result(results, figures_table(results, out))
+    output.result(results, last_screen(results, out))
 
 
 def _capture(
@@ -122,11 +119,11 @@ def _capture(
     held_out: dict[str, list[str]],
     output: Output,
 ) -> dict[str, Any]:
-    """Make the capture; its completion enqueues the job."""
+    """Make the capture, whose completion enqueues the job."""
     cost = service.post("/plans:validate", {})
     output.note(
         f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
-        f"devices, {cost['seconds']:.0f} s; a simulated rig renders each frame"
+        f"devices, {cost['seconds']:.0f} s; the simulated rig renders each frame"
     )
     truth = (args.out / "truth").resolve()
     options = {
@@ -163,7 +160,7 @@ def _job(children: Children, service: ServiceClient, job_id: str, out: Path) -> 
 
 
 def _start(children: Children, args: argparse.Namespace) -> str:
-    """Start the three processes as a user would; returns the URL when all are ready."""
+    """Start the three processes; returns the service's URL when all are ready."""
     from stage_service.cli.support.children import SimulatedRig, own_command
 
     out: Path = args.out
@@ -175,9 +172,9 @@ def _start(children: Children, args: argparse.Namespace) -> str:
         *("serve", "--json", "--rig", args.rig, "--devices", devices),
         *("--root", out, "--port", "0"),
     )
-    # Ended the latest first: the service, whose lamps must not wait for the worker.
-    worker = children.start("worker", own_command("worker", "--json", "--root", out), answers=True)
-    service = children.start("service", serve, answers=True)
+    # The latest ends first: the service, so that its lamps do not wait for the worker.
+    worker = children.start("worker", own_command("worker", "--json", "--root", out), pipe=True)
+    service = children.start("service", serve, pipe=True)
     url: str = children.first_line("service", service, READY_S)["url"]
     children.first_line("worker", worker, READY_S)
     return url
@@ -192,7 +189,7 @@ def hold_out(rig: Rig, camera: str | None = None) -> dict[str, list[str]]:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Read what was given, before an earlier demo goes, and make paths of it absolute."""
+    """Check the arguments before an earlier demo is removed; make their paths absolute."""
     from appearance.model.relight import PROCEDURAL, environment_map
     from reconstruction import read_obj, read_strands
 
@@ -207,9 +204,7 @@ def _check(args: argparse.Namespace) -> None:
         return
     if not Path(args.subject).is_file():
         names = ", ".join(SUBJECTS)
-        raise BadArgument(
-            f"--subject {args.subject}: there is no such file, and it is none of {names}"
-        )
+        raise BadArgument(f"--subject {args.subject}: expected a strand file or one of {names}")
     read_strands(args.subject)
     if args.head is not None:
         read_obj(args.head)
@@ -217,11 +212,11 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _prepare(out: Path) -> None:
-    """Make `out` an empty folder; what an earlier demo left there goes, anything else stays."""
+    """Make `out` an empty folder, if it is new or an earlier demo's."""
     if out.is_dir() and any(out.iterdir()):
         if not (out / MARK).is_file():
             raise BadArgument(
-                f"{out} holds something that no demo wrote: choose another folder with --out"
+                f"{out} has files that no demo wrote: choose another folder with --out"
             )
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -229,5 +224,5 @@ def _prepare(out: Path) -> None:
 
 
 def _link(link: Path, target: Path) -> None:
-    """A name in OUT for the folder that the service chose."""
+    """Link OUT/NAME to the folder that the service chose."""
     link.symlink_to(target.resolve().relative_to(link.parent.resolve()))

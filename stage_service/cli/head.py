@@ -1,4 +1,4 @@
-"""`head`: a head under digitised points, and a user's mesh made a template."""
+"""`head`: fit a head mesh to digitised points; make a template of a user's mesh."""
 
 from __future__ import annotations
 
@@ -16,26 +16,35 @@ from stage_service.cli.support.commands import (
 
 def add(commands: Commands) -> None:
     """Add the commands."""
-    group = add_group(commands, "head", "heads for captures that have none")
+    group = add_group(commands, "head", "head meshes for captures without one")
     fit = add_command(group, "fit", run_fit)
     fit.add_argument("points", type=Path)
-    fit.add_argument("--part", choices=["head", "scalp"], default="scalp", help="what they lie on")
-    fit.add_argument("--mesh", type=Path, help="the head to lay there (default: the generic one)")
-    fit.add_argument("--turn-deg", type=float, help="of the head about z, where known; 0 faces −y")
+    fit.add_argument(
+        "--part",
+        choices=["head", "scalp"],
+        default="scalp",
+        help="the surface that the points lie on",
+    )
+    fit.add_argument("--mesh", type=Path, help="the head mesh to fit (default: the generic one)")
+    fit.add_argument(
+        "--turn-deg", type=float, help="turn of the head about z, if known; 0 faces −y"
+    )
     fit.add_argument("--out", type=Path, required=True, help=".obj")
 
     mark = add_command(group, "mark", run_mark)
     mark.add_argument("mesh", type=Path, help=".obj")
     mark.add_argument("--up", choices=["y", "z"], default="z", help="the mesh's upward axis")
-    mark.add_argument("--above", type=float, help="cut off what is lower, in the mesh's unit")
+    mark.add_argument(
+        "--above", type=float, help="cut off all below this height, in the mesh's unit"
+    )
     mark.add_argument("--out", type=Path, required=True, help=".obj")
 
 
 def run_fit(args: argparse.Namespace, output: Output) -> None:
-    """Lay a head mesh under points of a head or of its scalp.
+    """Fit a head mesh to points of a head or of its scalp.
 
-    Fit the generic head, or the user's, to points (.obj, .ply, .csv, .npy; metres, z up) and write
-    it with its scalp marked: put it into a capture as head.obj.
+    Fit the generic head, or --mesh, to points (.obj, .ply, .csv, .npy; metres, z up) and write it
+    with its scalp marked, for a capture's head.obj.
     """
     import numpy as np
 
@@ -76,9 +85,9 @@ def run_fit(args: argparse.Namespace, output: Output) -> None:
 
 
 def run_mark(args: argparse.Namespace, output: Output) -> None:
-    """A user's head mesh as a template: upright, in metres, its scalp marked.
+    """Make a template of a head mesh: upright, in metres, with its scalp marked.
 
-    Cut and turn a head or body of any unit, mark the generic head's scalp on it, and write it in
+    Cut and turn a head or body in any unit, mark the generic head's scalp on it, and write it in
     the generic head's frame, for 'head fit --mesh' or the option head_mesh.
     """
     from reconstruction import read_obj, write_obj

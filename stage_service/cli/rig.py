@@ -1,4 +1,4 @@
-"""`rig check`: what a rig file describes, and how well it can triangulate."""
+"""`rig check`: devices of a rig file and their triangulation angles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stage_service.cli.support.commands import Commands, Output, add_command, ad
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    group = add_group(commands, "rig", "look at rig files")
+    group = add_group(commands, "rig", "inspect rig files")
     check = add_command(group, "check", run_check)
     check.add_argument("file", type=rig_path, help="rig file (.toml or .json)")
     check.add_argument("--radius", type=float, default=0.12, help="of the sphere, metres")
@@ -19,9 +19,9 @@ def add(commands: Commands) -> None:
 def run_check(args: argparse.Namespace, output: Output) -> None:
     """Check a rig file and report the angles between camera rays and planes of light.
 
-    Read a rig file, count what it holds, cost its full capture, and report for each camera and
-    projector the angle between camera rays and planes of light on a head-sized sphere: near 0 the
-    depth is worthless.
+    Report the rig's devices, the cost of its full capture, and for each camera and projector the
+    angle between camera rays and planes of light on a head-sized sphere. Near 0° depth is
+    undetermined.
     """
     from reconstruction.light_planes.plane_conditioning import condition
     from stage_service.config import load_rig_file
@@ -32,7 +32,7 @@ def run_check(args: argparse.Namespace, output: Output) -> None:
     rig_file = load_rig_file(args.file)
     rig = rig_file.rig
     if rig_file.devices is not None:
-        DeviceSet.of(rig_file)  # raises what a service would; connects to nothing
+        DeviceSet.of(rig_file)  # raises as a service would, without a connection
     data: dict[str, Any] = {
         "rig": rig.name,
         "cameras": len(rig.cameras),
@@ -48,7 +48,7 @@ def run_check(args: argparse.Namespace, output: Output) -> None:
         data["triangulation"] = found.to_dict()
         if found.triangulated < 0.5:
             data["warnings"].append(
-                f"only {found.triangulated:.0%} of what the cameras see is triangulated at "
+                f"only {found.triangulated:.0%} of the visible sphere is triangulated at "
                 f"{found.well_deg:g}° or more: turn or move projectors"
             )
     else:
@@ -88,7 +88,7 @@ def _table(data: dict[str, Any]) -> Any:
             )
         parts += [
             table,
-            f"{found['seen']:.0%} of the sphere is seen, {found['triangulated']:.0%} of that "
+            f"{found['seen']:.0%} of the sphere is visible, {found['triangulated']:.0%} of that "
             f"triangulated at {found['well_deg']:g}° or more",
         ]
     return Group(*parts, *(f"warning: {w}" for w in data["warnings"]))

@@ -29,14 +29,14 @@ def add(commands: Commands) -> None:
     imported.add_argument("--out", type=Path, required=True, help="new capture folder")
     imported.add_argument(
         "--pictures",
-        help="where pictures of single lights lie: {camera}/{light}.png; default: as import.toml "
-        "says, or images/{camera}/{light}.*",
+        help="paths of the OLAT images: {camera}/{light}.png; default: import.toml's, or "
+        "images/{camera}/{light}.*",
     )
     imported.add_argument("--settings", type=Path, help="instead of the folder's import.toml")
     imported.add_argument(
         "--dry-run",
         action="store_true",
-        help="say what was understood, and draw a contact sheet beside --out",
+        help="only list what would be imported, and draw a contact sheet next to --out",
     )
     imported.add_argument(
         "--cameras",
@@ -49,43 +49,43 @@ def add(commands: Commands) -> None:
         help="instead of lights.json: positions or directions in .json, .csv, .npy, .obj",
     )
     imported.add_argument(
-        "--light-distance", type=float, help="metres, where the lights are directions"
+        "--light-distance", type=float, help="metres; for lights given as directions"
     )
     unit = "m, cm, mm, inch, or its length in metres"
     imported.add_argument("--unit", type=_unit, help=f"of --cameras: {unit}; default: m")
-    imported.add_argument("--light-unit", type=_unit, help=f"of --lights, where it differs: {unit}")
+    imported.add_argument("--light-unit", type=_unit, help=f"of --lights, if it differs: {unit}")
     ups = ("x", "-x", "y", "-y", "z", "-z")
     imported.add_argument("--up", choices=ups, help="axis of the files' world that points up")
     imported.add_argument(
         "--camera-axes",
         choices=("opencv", "opengl"),
-        help="where they are not what the format of --cameras says",
+        help="if they differ from those of the format of --cameras",
     )
     presets = ("faceolat", "humanolat", "openillumination")
-    imported.add_argument("--preset", choices=presets, help="the folder is laid out as this set is")
+    imported.add_argument("--preset", choices=presets, help="layout of this published data set")
     imported.add_argument("--take", help="of --preset faceolat: ID20001")
 
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
-    """Re-read a whole capture and list what is wrong with it.
+    """Read a capture again and list its damaged files.
 
-    Re-read every file of a capture against its checksum; exit code 1 when anything is wrong.
+    Compare every file of a capture with its checksum; exit code 1 if any differs.
     """
     from reconstruction import verify
 
     if not args.capture.is_dir():
-        raise BadArgument(f"{args.capture}: no such folder: give a capture's")
+        raise BadArgument(f"{args.capture}: no such folder: name a capture folder")
     with progress_bar("verify") as progress:
         problems = verify(args.capture, progress)
-    text = "\n".join(problems) or f"{args.capture} is sound"
+    text = "\n".join(problems) or f"{args.capture}: every file is intact"
     output.result({"capture": str(args.capture), "problems": problems}, text)
     return FAILED if problems else 0
 
 
 def run_import(args: argparse.Namespace, output: Output) -> None:
-    """Turn pictures made elsewhere into a capture.
+    """Make a capture of images from elsewhere.
 
-    Read cameras, lights, pictures by the patterns of import.toml, and masks.
+    Read cameras, lights and masks, and images by the patterns of import.toml.
     """
     from reconstruction.capture.contact_sheet import contact_sheet
     from reconstruction.capture.writer import require_vacant
@@ -96,16 +96,16 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         output.note(note)
     if args.dry_run:
         require_vacant(args.out)
-        out = args.out.resolve()  # "." has a name, too
+        out = args.out.resolve()  # so that "." has a name
         sheet = out.with_name(f"{out.name}-contact-sheet.png")
         sheet.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(understood, sheet)
-        text = "\n".join([*understood.said(), f"{sheet}: what the pictures look like"])
+        text = "\n".join([*understood.said(), f"{sheet}: contact sheet"])
         output.result({"sheet": str(sheet), **understood.counts(), "notes": notes}, text)
         return
     with progress_bar("import") as progress:
         capture = understood.write(args.out, progress)
-        progress("holding cameras and lights against the pictures", 1.0)
+        progress("checking cameras and lights against the images", 1.0)
         doubts = check_scene(capture)
     for note in doubts:
         output.note(note)
@@ -120,7 +120,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
 
 
 def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
-    """What lies in the folder, and what there is to be told of it."""
+    """The import of the folder, and notes for the user."""
     from dataclasses import replace
 
     from reconstruction.capture.import_folder import Import, settings_of
@@ -132,41 +132,43 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
     given = {f: value for f, value in where.items() if value is not None}
     if args.take is not None and args.preset != "faceolat":
-        raise BadArgument("--take goes with --preset faceolat")
+        raise BadArgument("--take needs --preset faceolat")
     for name in ("settings", "pictures", "light_distance") if args.preset else ():
         if getattr(args, name) is not None:
-            raise BadArgument(f"--{name.replace('_', '-')} does not go with --preset: leave it out")
+            raise BadArgument(
+                f"--{name.replace('_', '-')} cannot be combined with --preset: leave it out"
+            )
     if args.preset is not None:
         parse_options(PlacementOptions, given, "import")
         of_set = PresetFiles(args.folder, args.take, args.cameras, args.lights)
         take = read_preset(args.preset, of_set, mean_light, given)
         settings, found = understood(take)
-        seen = Import.of(args.folder, take.geometry, settings, found)
-        return seen, [*take.geometry.notes, *seen.found.notes]
+        imported = Import.of(args.folder, take.geometry, settings, found)
+        return imported, [*take.geometry.notes, *imported.found.notes]
     settings = settings_of(args.folder, args.settings)
-    said = settings.geometry
-    asked = {f: getattr(args, f) for f in ("cameras", "lights")}
-    asked = {f: path.resolve() for f, path in asked.items() if path is not None}
+    configured = settings.geometry
+    options = {f: getattr(args, f) for f in ("cameras", "lights")}
+    options = {f: path.resolve() for f, path in options.items() if path is not None}
     if args.light_distance is not None:
-        asked["light_distance"] = args.light_distance
-    where_said = {f: v for f, v in vars(said.placement).items() if v is not None}
-    named = {**vars(said), **asked, "placement": {**where_said, **given}}
+        options["light_distance"] = args.light_distance
+    placement = {f: v for f, v in vars(configured.placement).items() if v is not None}
+    named = {**vars(configured), **options, "placement": {**placement, **given}}
     files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
     geometry = read_geometry(files) if files.cameras or files.lights else None
     if geometry is None and files != GeometryFiles():
         raise BadArgument(
-            "units, light distance, up and camera axes go with --cameras; cameras.json and "
+            "units, light distance, up and camera axes need --cameras; cameras.json and "
             "lights.json are in metres, z up, with OpenCV's axes"
         )
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)
         settings = replace(settings, pictures=patterns)
-    seen = Import.of(args.folder, geometry, settings)
-    return seen, [*(geometry.notes if geometry else []), *seen.found.notes]
+    imported = Import.of(args.folder, geometry, settings)
+    return imported, [*(geometry.notes if geometry else []), *imported.found.notes]
 
 
 def _unit(text: str) -> str | float:
-    """A unit's name, or its length."""
+    """A unit's name, or its length in metres."""
     if text in ("m", "cm", "mm", "inch"):
         return text
     try:

@@ -1,4 +1,4 @@
-"""What results are called where people read them: in the terminal, the README's table, the page."""
+"""Titles of results on the terminal, in the benchmark's table and on the page."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 GROUPS = ("held_out_lights", "held_out_camera")
 STRANDS = {
     "ours": "ours",
-    "true_directions": "ours, turned as the truth is over a pixel",
+    "true_directions": "ours, true directions over a pixel",
     "hull_smooth_field": "hull + smooth field",
     "hull_vertical": "hull + vertical",
 }
 STRAND_FIGURES: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("strands", ",.0f", "", ("lengths", "pred", "strands")),
     ("metres", ",.0f", " m", ("lengths", "pred", "total_m")),
-    ("most of a strand on one true strand", ".2f", "", ("connectivity", "pred", "on_one", "mean")),
-    ("most of a true strand by one", ".2f", "", ("connectivity", "true", "by_one", "mean")),
+    ("share of a strand on one true strand", ".2f", "", ("connectivity", "pred", "on_one", "mean")),
+    ("share of a true strand on one strand", ".2f", "", ("connectivity", "true", "by_one", "mean")),
 )
-"""How long and how whole strands are: title, form, unit, and the figure's place in the scores."""
+"""Length and continuity of strands: title, format, unit, path in the scores."""
 
 OF_TRUTH = {"strands": ("lengths", "true", "strands"), "metres": ("lengths", "true", "total_m")}
 PICTURES = {
@@ -27,7 +27,7 @@ PICTURES = {
     "inverse_rendering": "inverse rendering",
     "sun_fit": "Sun's fit",
     "without_field": "without the field",
-    "guided_frames": "nearest frames, changed as the model says",
+    "guided_frames": "nearest frames × model ratio",
     "diffuse": "diffuse",
     "mean_colour": "mean colour",
     "three_nearest": "three nearest lights",

@@ -243,8 +243,8 @@ def _quality(model: Model, results: Mapping[str, Any]) -> Html:
     if not parts:
         return Html("")
     note = (
-        "One run: how much these figures vary from seed to seed is not known. "
-        "Several runs side by side: hairstage evaluate table."
+        "One run: the spread over seeds is not known. "
+        "To compare several runs: hairstage bench demo --results RESULTS…"
     )
     return joined([*parts, element("p", note, class_="quiet")])
 

@@ -26,10 +26,10 @@ from appearance.render.visibility import above_faces, reached, within_fibres
 from reconstruction import Camera, Capture, Light, Model
 from reconstruction.arrays import Array
 from reconstruction.geometry.lights import dome_positions
+from stage_service.viewer.errors import BadLight
 from stage_service.viewer.indirect import BakeOptions, IndirectLight, bake
 from stage_service.viewer.packing import PackedStrands
 from stage_service.viewer.resting import RestOptions, indirect_in_view
-from stage_service.viewer.viewed import BadLight
 
 MOST_LIGHTS = 8
 """Lights that the shader adds up."""

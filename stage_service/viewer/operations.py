@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from reconstruction import Camera, Capture, CaptureError, Model
-from stage_service.viewer.viewed import BadLight, NothingToView, Viewed
+from stage_service.viewer.errors import BadLight, NothingToView
+from stage_service.viewer.viewed import Viewed
 
 Weights = dict[str, list[float]]
 """By a light's number, as JSON has it: what its red, green and blue are multiplied by."""

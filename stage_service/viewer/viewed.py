@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from reconstruction import Capture, Mesh, Model, Strands
 from reconstruction.arrays import Floats
+from stage_service.viewer.errors import BadLight as BadLight
+from stage_service.viewer.errors import NothingToView as NothingToView
 from stage_service.viewer.packing import PackedStrands
 
 if TYPE_CHECKING:
@@ -22,14 +24,6 @@ FAR = 5e-3
 
 MOST_PIXELS = 100_000
 """That a view may have which light is traced for."""
-
-
-class NothingToView(LookupError):
-    """The model, the capture or the part of it is not there; the message says what to do."""
-
-
-class BadLight(ValueError):
-    """Light that cannot be made; the message says what is wrong with it."""
 
 
 class Viewed:

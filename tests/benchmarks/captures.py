@@ -69,7 +69,7 @@ class SimulatedCapture:
             devices = children.ready("simulators", command, 300)["devices"]
             serve = own_command("serve", "--json", "--rig", rig, "--devices", devices)
             serve += ["--root", str(folder), "--port", "0"]
-            service = children.start("service", serve, answers=True)
+            service = children.start("service", serve, pipe=True)
             with ServiceClient(children.first_line("service", service, 60)["url"]) as client:
                 body: dict[str, Any] = {"plan": {}}
                 if (truth / "head.obj").is_file():

@@ -1,4 +1,4 @@
-"""`hairstage edit`: a fitted model in other colours, rougher, shorter, or with other strands."""
+"""`hairstage edit`: change colour, roughness, length or strands of a fitted model."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from reconstruction.arrays import Array
 
 WISP_CELLS = 32
-"""Cells of a brush across the scalp's map, at least."""
+"""Least number of cells across the scalp's map for --wisp."""
 OFF = 0.02
-"""Metres from other strands' roots to the model's, in the median, that are hardly on one scalp."""
+"""Median distance of roots, metres, beyond which other strands are on another scalp."""
 DYED_LAYERS = 8
-"""Layers along strands where only a part of their length is dyed, at least."""
+"""Least number of layers along strands for --along."""
 
 
 def add(commands: Commands) -> None:
@@ -27,17 +27,17 @@ def add(commands: Commands) -> None:
     edit = add_command(commands, "edit", run)
     edit.add_argument("model", type=Path, help="fitted model folder")
     edit.add_argument("--out", type=Path, required=True, help="the new model folder")
-    edit.add_argument("--capture", type=Path, help="the capture that gives the head")
-    edit.add_argument("--strands", type=Path, help="a strand file to wear the model's appearance")
+    edit.add_argument("--capture", type=Path, help="the capture, for its head")
+    edit.add_argument("--strands", type=Path, help="a strand file that gets the model's appearance")
     edit.add_argument(
-        "--cut", type=float, metavar="METRES", help="cut strands that are longer to this length"
+        "--cut", type=float, metavar="METRES", help="cut longer strands to this length"
     )
     colour = edit.add_mutually_exclusive_group()
     colour.add_argument(
         "--recolour",
         type=_numbers(3),
         metavar="R,G,B",
-        help="the colour that dense hair shows, linear RGB above 0 and at most 1",
+        help="colour of dense hair, linear RGB, above 0 and at most 1",
     )
     colour.add_argument(
         "--pigment",
@@ -63,10 +63,10 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """A fitted model in other colours, rougher, shorter, or with other strands.
+    """Change colour, roughness, length or strands of a fitted model.
 
-    Write the edited MODEL as a new model folder, which render and export take. Several edits are
-    made in this order: strands, cut, colour, roughness.
+    Write the edited MODEL as a new model folder, for render and export. Edits are applied in this
+    order: strands, cut, colour, roughness.
     """
     import numpy as np
     from scipy.spatial import cKDTree
@@ -79,13 +79,11 @@ def run(args: argparse.Namespace, output: Output) -> None:
     names = ("strands", "cut", "recolour", "pigment", "roughen")
     edits = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
     if not edits:
-        raise BadArgument(f"say what to edit: one of {', '.join('--' + n for n in names)}")
+        raise BadArgument(f"no edit is given: use one of {', '.join('--' + n for n in names)}")
     if (args.wisp or args.along != (0.0, 1.0)) and not {"recolour", "pigment"} & set(edits):
-        raise BadArgument(
-            "--wisp and --along say where to colour: give --recolour or --pigment too"
-        )
+        raise BadArgument("--wisp and --along need --recolour or --pigment")
     if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
-        raise BadArgument(f"--out {args.out} is no empty folder: choose a new one")
+        raise BadArgument(f"--out {args.out} is not an empty folder: choose a new one")
     source = Model(args.model)
     fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
     if args.strands is not None:
@@ -94,8 +92,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
         off = float(np.median(distance))
         if off > OFF:
             output.note(
-                f"warning: half of the strands of {args.strands} begin over {off:.2g} m from all "
-                "of the model's: is the file in metres, z up, in the model's frame?"
+                f"warning: roots of {args.strands} are {off:.2g} m (median) from the model's: "
+                "check "
+                "that the file is in metres, z up, in the model's frame"
             )
     if args.cut is not None:
         fitted = cut(fitted, args.cut)
@@ -111,8 +110,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     write_page(model)
     if fitted.head is None:
         output.note(
-            f"warning: {args.model} holds no head, so {model} has none and is rendered without: "
-            "give --capture where the capture has one"
+            f"warning: {args.model} has no head, so {model} is rendered without one: give "
+            "--capture if the capture has a head"
         )
     data: dict[str, Any] = {"model": str(model), "strands": len(fitted.strands)}
     data["edits"] = {k: str(v) if isinstance(v, Path) else v for k, v in edits.items()}

@@ -1,4 +1,4 @@
-"""`hairstage export`: a model for other programs."""
+"""`hairstage export`: convert a model for other programs."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ ONLY = {
     "cards": ("gltf",),
     "environment": ("mitsuba",),
 }
-"""What takes these options."""
+"""Targets that accept these options."""
 STRANDS = ("abc", "hair")
-"""What holds strands alone and needs no fit."""
+"""Formats of strands alone, without a fit."""
 SIZE = 640
-"""Pixels across of a Mitsuba scene's camera, where no camera of a rig says: relit.png's."""
+"""Width in pixels of a Mitsuba scene's camera without --camera."""
 
 OFF = 0.5
-"""Pixels that a picture of Mitsuba's may be off without a word."""
+"""Distortion in pixels of Mitsuba's camera from which a warning is printed."""
 
 
 def add(commands: Commands) -> None:
@@ -39,15 +39,21 @@ def add(commands: Commands) -> None:
     export = add_command(commands, "export", run)
     export.add_argument("model", type=Path, help="model folder")
     export.add_argument("--to", choices=(*SUFFIXES, *FOLDERS), required=True)
-    export.add_argument("--out", type=Path, required=True, help="file, or folder of several")
-    export.add_argument("--capture", type=Path, help="the capture that gives rig and head")
     export.add_argument(
-        "--strands", type=int, help="so many, drawn at random, their radius larger to cover as much"
+        "--out", type=Path, required=True, help="file, or folder for formats of several files"
+    )
+    export.add_argument("--capture", type=Path, help="the capture, for its rig and head")
+    export.add_argument(
+        "--strands",
+        type=int,
+        help="export a random subset, with larger radius to keep the coverage",
     )
     export.add_argument(
-        "--guides", type=int, help="strands that stand for clumps, given apart (default: 0)"
+        "--guides", type=int, help="number of guide strands, exported separately (default: 0)"
     )
-    export.add_argument("--cards", type=int, help="ribbons of gltf's finest level (default: 600)")
+    export.add_argument(
+        "--cards", type=int, help="hair cards of gltf's finest level (default: 600)"
+    )
     export.add_argument("--seed", type=int, default=0)
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
     export.add_argument(
@@ -56,14 +62,14 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """A model for other programs.
+    """Convert a model for other programs.
 
-    Write MODEL for others, with its fit, or in an even brown without one. usd: strands, head and
+    Write MODEL with its fitted material, or in a uniform brown without one. usd: strands, head and
     MaterialX hair, z up; houdini: the same, y up; blender: a folder with a script that makes Hair
     Curves with Principled Hair; unreal: Alembic in centimetres with groom_ attributes; gltf: hair
     cards in three levels of detail; mitsuba: a folder with a scene for stock Mitsuba 3; maps: an
-    OpenEXR file for each layer of the hair maps; abc, hair: the strands alone, for the readers of
-    Alembic and cyHair.
+    OpenEXR file for each layer of the hair maps; abc, hair: the strands alone, as Alembic and
+    cyHair.
     """
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
@@ -82,11 +88,10 @@ def run(args: argparse.Namespace, output: Output) -> None:
         args.to in FOLDERS or out.name in FILES
     ):
         raise BadArgument(
-            f"--out {out} would be among the files of a model or a capture, and take the place of "
-            "one: choose another folder"
+            f"--out {out} would replace a file of a model or a capture: choose another folder"
         )
     if args.camera is not None and (args.capture is None or args.to != "mitsuba"):
-        raise BadArgument("--camera is a view for mitsuba, of the rig of --capture")
+        raise BadArgument("--camera needs --to mitsuba and --capture")
     for name, takers in ONLY.items():
         if getattr(args, name) is not None and args.to not in takers:
             raise BadArgument(f"--{name} is for --to {' or '.join(takers)}, not {args.to}")
@@ -97,7 +102,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     moved = capture.plan.get("import", {}).get("origin") if capture is not None else None
     if moved is not None:
         by = ", ".join(f"{x:g}" for x in moved)
-        output.note(f"the capture was moved: add ({by}) m to have all in the world it came from")
+        output.note(f"the import moved the capture: add ({by}) m for the original coordinates")
     if args.to in STRANDS:
         strands, _ = thinned(model.strands(), options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -107,13 +112,13 @@ def run(args: argparse.Namespace, output: Output) -> None:
         groom = Groom.load(model, capture, options)
         if not model.has("appearance.json"):
             output.note(
-                f"warning: {model} has no fit: its hair goes out in an even brown; "
-                "'hairstage fit CAPTURE MODEL' first measures colour and roughness"
+                f"warning: {model} has no fitted material and is exported in a uniform brown: run "
+                "'hairstage fit CAPTURE MODEL' first"
             )
         if model.has("field.npz"):
-            output.note(f"warning: {model} renders with a field, of which exports know nothing")
+            output.note(f"warning: exports do not contain the reflectance field of {model}")
         if groom.head is None and args.to != "maps":
-            output.note(f"warning: {model} holds no head: give the capture that has it (--capture)")
+            output.note(f"warning: {model} has no head: give the capture that has one (--capture)")
         files = _write(args, output, groom, capture, options)
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
 
@@ -125,7 +130,7 @@ def _write(
     capture: Capture | None,
     options: ExportOptions,
 ) -> list[Path]:
-    """Write the file or folder; returns what was written."""
+    """Write the file or folder; returns the paths."""
     out: Path = args.out
     out.parent.mkdir(parents=True, exist_ok=True)
     if args.to in ("usd", "houdini"):
@@ -159,7 +164,7 @@ def _write(
         camera = capture.rig.camera(args.camera)
         if (off := off_by(camera)) > OFF:
             output.note(
-                f"warning: {camera.name} has a lens, or pixels that are not square: Mitsuba's "
-                f"camera has neither, and its pictures are off by up to {off:.1f} pixels"
+                f"warning: {camera.name} has lens distortion or non-square pixels, which Mitsuba's "
+                f"camera lacks: images are off by up to {off:.1f} pixels"
             )
     return export_mitsuba(groom, out, View(camera, environment_map(args.environment or "studio")))

@@ -1,4 +1,4 @@
-"""`hairstage fit`: the appearance of a capture and its strands, without a service."""
+"""`hairstage fit`: fit the appearance of a capture and its strands."""
 
 from __future__ import annotations
 
@@ -30,31 +30,30 @@ def add(commands: Commands) -> None:
     fit.add_argument(
         "--field",
         choices=FIELDS,
-        help="then fit a field of reflectance on top of the material: a smooth factor on its light "
-        "(modulation) or light added to it (additive); none removes it",
+        help="also fit a field of reflectance over the material: a smooth factor on its radiance "
+        "(modulation) or radiance added to it (additive); none removes it",
     )
     fit.add_argument("--field-options", help="the field's options as JSON")
     add_view(fit)
     fit.add_argument(
         "--environment",
         default="studio",
-        help="of the relit picture, where cameras or lights are held out: studio, sky, or an .hdr "
-        "or .exr file",
+        help="environment of the relit image, if cameras or lights are held out: studio, sky, or "
+        "an .hdr or .exr file",
     )
     fit.add_argument("--seed", type=int, default=0)
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """The hair's appearance from a capture and its strands.
+    """Fit the hair's appearance from a capture and its strands.
 
     Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
-    inverse_rendering goes on from there, with a sun fit first where there is none that held out the
-    same: roughness and colour of all hair by rendering or, with --options '{"fit": {"variant":
-    "lights"}}', of hair that varies over the scalp and along strands, and the lights as they are
-    found, in MODEL/hair_maps.npz and lights.json; stopped, it goes on where it was. With --field,
-    MODEL/field.npz holds what the hair reflects beyond that, on top of a fit that is there already
-    where it held out the same and --options ask for no other. With held-out cameras or lights,
-    judge the model on them.
+    inverse_rendering starts from a sun fit, which is made first if none held out the same cameras
+    and lights. It estimates roughness and colour by rendering: uniform or, with --options '{"fit":
+    {"variant": "lights"}}', over the scalp and along strands, together with the lights, in
+    MODEL/hair_maps.npz and lights.json. An interrupted run is resumed. --field writes
+    MODEL/field.npz, the reflectance that the material lacks; an existing fit is used if it held out
+    the same and --options is not given. Held-out cameras and lights are used to score the model.
     """
     from appearance import HeldOut
     from appearance.model.relight import environment_map
@@ -71,13 +70,13 @@ def run(args: argparse.Namespace, output: Output) -> None:
     from stage_service.model_page import write_page
 
     if args.field_options and args.field in (None, "none"):
-        raise BadArgument("--field-options says how a field is fitted: say which with --field")
+        raise BadArgument("--field-options needs --field")
     of_field = read_json(args.field_options)
     if "field" in of_field:
-        raise BadArgument("--field says which field is fitted, not --field-options")
+        raise BadArgument("--field-options may not set field: use --field")
     of_method = read_json(args.options)
     model, inverse = Model(args.model), args.method == "inverse_rendering"
-    asked = {
+    given = {
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
         "reduced": args.reduce,
@@ -86,8 +85,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "inverse_rendering" if inverse else "fit": of_method,
         "fields": {"field": args.field or "none", **of_field},
     }
-    options = parse_options(JobOptions, asked)
-    environment_map(options.environment)  # not after all of the fits
+    options = parse_options(JobOptions, given)
+    environment_map(options.environment)  # fail before the work
     data: dict[str, Any] = {"model": str(model), "method": args.method}
     held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
     there = FittedAppearance.is_of(model, held_out)

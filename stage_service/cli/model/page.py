@@ -15,16 +15,18 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """One page on a model.
+    """Write a model's page.
 
-    Write MODEL/index.html: which of its files is the result, pictures, figures, warnings, plots,
-    what was left out. Jobs, 'reconstruct', 'fit', 'render' and 'edit' write it by themselves.
+    Write MODEL/index.html: results, images, figures, warnings, plots and skipped work. Jobs,
+    'reconstruct', 'fit', 'render' and 'edit' write it too.
     """
     from reconstruction import Model
     from stage_service.model_page import write_page
 
     model = Model(args.model)
     if not (model.has("strands.npz") or model.has("report.json")):
-        raise BadArgument(f"{args.model} is no model: neither strands.npz nor report.json is there")
+        raise BadArgument(
+            f"{args.model} is not a model: it has neither strands.npz nor report.json"
+        )
     page = write_page(model)
     output.result({"page": str(page)}, str(page))

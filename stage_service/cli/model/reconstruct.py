@@ -1,4 +1,4 @@
-"""`hairstage reconstruct`: strands from a capture, without a service."""
+"""`hairstage reconstruct`: strands from a capture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from reconstruction.estimate import Estimate
     from stage_service.jobs.records import JobOptions
 
-MEMORY_SHARE = 0.8  # of this machine's that a reconstruction may take without a warning
+MEMORY_SHARE = 0.8  # of this machine's memory; above it, a larger --reduce is suggested
 
 
 def add(commands: Commands) -> None:
@@ -34,40 +34,42 @@ def add(commands: Commands) -> None:
     reconstruct.add_argument("--method", choices=METHODS, default="auto")
     reconstruct.add_argument("--out", type=Path, help="model folder")
     reconstruct.add_argument(
-        "--estimate", action="store_true", help="only tell what it would take on this machine"
+        "--estimate",
+        action="store_true",
+        help="only estimate seconds, memory and disk on this machine",
     )
     reconstruct.add_argument("--options", help="the method's options as JSON")
     add_view(reconstruct)
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """Strands from a capture.
+    """Reconstruct strands from a capture.
 
-    --method auto takes what the capture holds, and says what it is: planes of light where there is
-    a sweep, else the masks' hull, filled along what single lights show.
+    --method auto selects the method by the capture: planes of light if there is a sweep, else the
+    hull of the masks, filled along directions from OLAT frames.
 
-    Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json, and a page on them,
-    MODEL/index.html. With --estimate, tell seconds, memory and disk instead, by stage: frames and
-    filters are tried for some seconds, the rest is a table scaled by this machine's speed.
+    Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json and the page MODEL/index.html. With
+    --estimate, print seconds, memory and disk by stage instead: frames and filters are timed for
+    some seconds, the rest is a table scaled by this machine's speed.
     """
     from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
     from stage_service.jobs.steps import StepContext, reconstruct
     from stage_service.model_page import write_page
 
-    asked = {
+    given = {
         "method": args.method,
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
         "reduced": args.reduce,
         "reconstruct": read_json(args.options),
     }
-    options, capture = parse_options(JobOptions, asked), Capture(args.capture)
+    options, capture = parse_options(JobOptions, given), Capture(args.capture)
     if args.estimate:
         _estimate(capture, options, output)
         return
     if args.out is None:
-        raise BadArgument("--out MODEL says where the strands go; or ask for an --estimate")
+        raise BadArgument("give --out MODEL, or --estimate")
     _check_folder(args.out)
     model = Model(args.out)
     with progress_bar("reconstruct") as progress:
@@ -90,46 +92,49 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
 
 def _check_folder(out: Path) -> None:
-    """`BadArgument` where a model, which removes what its folder holds of earlier ones (a head,
-    plots, pictures), would remove others' files."""
+    """Raise `BadArgument` if files of others are in `out`: a model removes those with its names."""
     if out.exists() and not out.is_dir():
         raise BadArgument(f"--out {out} is a file: a model is a folder")
     there = {p.name for p in out.iterdir() if p.name[0] != "."} if out.exists() else set()
     if there & {"rig.json", "cameras.json"}:
         raise BadArgument(
-            f"--out {out} is a capture, or a folder to import: its head would be taken for an "
-            "earlier model's and removed: choose a new folder"
+            f"--out {out} is a capture or a folder to import, whose head would be removed: "
+            "choose a "
+            "new folder"
         )
     if there and not there & {"masks", "strands.npz", "report.json"}:
         raise BadArgument(
-            f"--out {out} holds files and no model, which would remove those that are called as "
-            "its own: choose a new folder"
+            f"--out {out} has files that are no model's, and a model may replace them: choose a "
+            "new "
+            "folder"
         )
 
 
 def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
-    """Tell what reconstructing `capture` would take."""
+    """Print the estimated cost of reconstructing `capture`."""
     from reconstruction.estimate import estimate
 
-    asked = replace(options.reconstruct, held_out=options.held_out_cameras, seed=options.seed)
+    cost_options = replace(
+        options.reconstruct, held_out=options.held_out_cameras, seed=options.seed
+    )
     capture, by = capture.without_lights(options.held_out_lights), options.reduced
     machine_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
 
     def tried(by: int) -> Estimate:
         with progress_bar("estimate") as progress:
             view = capture.view(reduced=by)
-            return estimate(view, method=options.method, options=asked, progress=progress)
+            return estimate(view, method=options.method, options=cost_options, progress=progress)
 
     found = tried(by)
     lines = [f"{'stage':<14}{'seconds':>9}{'memory':>11}  measured here"]
     lines += [
         f"{s.name:<14}{s.seconds:9.0f}{s.peak_gb:8.1f} GB{s.measured:8.0%}" for s in found.stages
     ]
-    meanwhile = f", and {found.working_gb:.1f} GB more meanwhile" if found.working_gb else ""
+    temporary = f", {found.working_gb:.1f} GB more temporarily" if found.working_gb else ""
     lines.append(
         f"{_duration(found.seconds)} in all, {found.peak_gb:.1f} GB of this machine's "
         f"{machine_gb:.0f}; {found.frames:,} frames are read, the model takes {found.disk_gb:.1f} "
-        f"GB of disk{meanwhile}. A third more or less is usual, where nothing else runs."
+        f"GB of disk{temporary}. Estimates are usually within a third on an idle machine."
     )
     data = {"reduced": by, "method": found.method, **asdict(found), "seconds": found.seconds}
     if found.peak_gb > MEMORY_SHARE * machine_gb:
@@ -137,7 +142,7 @@ def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
             if (less := tried(by)).peak_gb < MEMORY_SHARE * machine_gb:
                 data["fits"] = {"reduced": by, "seconds": less.seconds, "peak_gb": less.peak_gb}
                 lines.append(
-                    f"That is more memory than there is: with --reduce {by} it takes "
+                    f"That exceeds the memory of this machine: --reduce {by} takes "
                     f"{_duration(less.seconds)} and {less.peak_gb:.1f} GB."
                 )
                 break

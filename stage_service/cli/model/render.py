@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 FIELDS = ("none", "interpolation")
 SIZE, FILM_SIZE = 512, 192
-"""Pixels across of a picture and of an animation, where no camera of a rig says."""
+"""Width in pixels of an image and of an animation without --camera."""
 MOST_SIZE = 16_384
 SPP, FILM_SPP = 64, 6
 FRAMES = 24
@@ -28,22 +28,22 @@ def add(commands: Commands) -> None:
     """Add the command."""
     render = add_command(commands, "render", run)
     render.add_argument("model", type=Path)
-    render.add_argument("--capture", type=Path, help="the capture that gives rig and head")
+    render.add_argument("--capture", type=Path, help="the capture, for its rig and head")
     render.add_argument("--camera", help="a camera of the rig, instead of a three-quarter view")
     render.add_argument(
         "--light",
         action="append",
         default=[],
-        help="a light of the rig (repeat for more); the environment is then dark unless given",
+        help="a light of the rig (repeat for more); without an environment unless one is given",
     )
     render.add_argument(
-        "--environment", help="studio (where nothing else is given), sky, or an .hdr or .exr file"
+        "--environment", help="studio (default without --light), sky, or an .hdr or .exr file"
     )
     render.add_argument(
         "--out",
         type=Path,
-        help=".png (exposed, sRGB) or .exr (linear), instead of MODEL/render.png; .webp of an "
-        "animation, instead of MODEL/render.webp",
+        help=".png (exposed, sRGB) or .exr (linear), default MODEL/render.png; .webp of an "
+        "animation, default MODEL/render.webp",
     )
     render.add_argument(
         "--field",
@@ -54,11 +54,11 @@ def add(commands: Commands) -> None:
     render.add_argument(
         "--guide",
         choices=("kajiya_kay", "none", "model"),
-        help="what guides an interpolation, kajiya_kay where nothing is said; none is the standard "
-        "one; model, for a camera of the capture, is what our own renders say",
+        help="guide of an interpolation: kajiya_kay (default), none, or model: the ratio of our "
+        "renders, for a camera of the capture",
     )
     render.add_argument(
-        "--refine", action="store_true", help="turn the guide's tangents to each camera's frames"
+        "--refine", action="store_true", help="refine the guide's tangents on each camera's frames"
     )
     render.add_argument(
         "--strands",
@@ -68,31 +68,34 @@ def add(commands: Commands) -> None:
     )
     moves = render.add_mutually_exclusive_group()
     moves.add_argument(
-        "--turntable", action="store_true", help="an animation: the model and the room turn"
+        "--turntable", action="store_true", help="animation: model and environment turn"
     )
     moves.add_argument(
         "--turning-light",
         action="store_true",
-        help="an animation: the environment turns, the model stays",
+        help="animation: the environment turns",
     )
     moves.add_argument(
-        "--sway", type=float, metavar="DEGREES", help="an animation: the hair swings, at the tips"
+        "--sway",
+        type=float,
+        metavar="DEGREES",
+        help="animation: the hair swings by this angle at the tips",
     )
-    render.add_argument("--frames", type=int, help=f"of an animation; default: {FRAMES}")
-    render.add_argument("--size", type=int, help="pixels across, where no --camera says")
+    render.add_argument("--frames", type=int, help=f"frames of an animation; default: {FRAMES}")
+    render.add_argument("--size", type=int, help="width in pixels, without --camera")
     render.add_argument(
-        "--spp", type=int, help="samples a pixel; default: 64, in an animation 6, smoothed"
+        "--spp", type=int, help="samples per pixel; default: 64; in an animation 6, smoothed"
     )
     render.add_argument("--seed", type=int, default=0)
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """A model under an environment map, or lights of its rig.
+    """Render a model under an environment map or lights of its rig.
 
-    Render MODEL's strands with its fitted appearance (its hair maps and the lights as found, where
-    there are any), in the pose of its capture or of other --strands. With a field, its hair is what
-    the capture's frames say of it. A turntable, light that turns, hair that sways, or strands of
-    several poses become a WebP animation, their indirect light smoothed.
+    Render MODEL's strands with its fitted appearance (hair maps and estimated lights, if it has
+    them), in the pose of its capture or of other --strands. --field interpolation interpolates the
+    hair between captured frames. --turntable, --turning-light, --sway and strands of several poses
+    write a WebP animation with smoothed indirect light.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -102,7 +105,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
 
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Render what was asked for; returns what was written."""
+    """Render the image or animation; returns its path and figures."""
     from appearance import Environment, FittedModel, Sampling
     from appearance.model.relight import environment_map, three_quarter_view
     from reconstruction import Capture, Model
@@ -116,21 +119,23 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.spp is not None and args.spp < 1:
         raise ValueError(f"--spp {args.spp}: expected 1 or more")
     if (args.guide or args.refine) and args.field != "interpolation":
-        raise ValueError("--guide and --refine go with --field interpolation")
+        raise ValueError("--guide and --refine need --field interpolation")
     if args.refine and args.guide in ("none", "model"):
-        raise ValueError(f"--refine turns kajiya_kay's tangents, not those of --guide {args.guide}")
+        raise ValueError(f"--refine needs --guide kajiya_kay, not {args.guide}")
     only_lights = args.light and args.environment is None and args.strands is None
     if args.guide == "model" and not (only_lights and args.camera):
-        raise ValueError("--guide model: for a --camera of the capture, its pose and --light")
+        raise ValueError(
+            "--guide model: for a --camera of the capture, in its pose and under --light"
+        )
     if args.size is not None and args.camera is not None:
-        raise ValueError("--size: a --camera's pictures have its own size: leave out one of them")
+        raise ValueError("--size and --camera exclude each other: leave out one of them")
     if args.size is not None and not 16 <= args.size <= MOST_SIZE:
         raise ValueError(f"--size {args.size}: expected 16 to {MOST_SIZE}")
     capture = Capture(args.capture) if args.capture is not None else None
     if capture is None and (args.camera is not None or args.light):
-        raise ValueError("--camera and --light name parts of a rig: say whose with --capture")
+        raise ValueError("--camera and --light need the rig: give --capture")
     if capture is None and args.field == "interpolation":
-        raise ValueError("--field interpolation needs the frames: say whose with --capture")
+        raise ValueError("--field interpolation needs captured frames: give --capture")
     poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
     moves = args.turntable or args.turning_light or args.sway is not None or len(poses) > 1
     _check_animation(args, len(poses), moves)
@@ -152,10 +157,10 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if moves:
         found |= _animate(args, fitted, poses, (camera, lights, maps, sampling), out, progress)
     else:
-        whose = fitted, model, capture
+        sources = fitted, model, capture
         lit = camera, lights, maps, sampling
-        image, told = _still(args, whose, poses[0] if poses else None, lit, progress)
-        found |= told
+        image, figures = _still(args, sources, poses[0] if poses else None, lit, progress)
+        found |= figures
         with writing(out) as part:
             _write(part, image)
     if args.out is None:
@@ -173,25 +178,23 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
-    """`ValueError` for options that do not go together."""
+    """Raise `ValueError` for options that exclude each other."""
     suffixes = (".webp",) if moves else (".png", ".exr")
     if args.out is not None and args.out.suffix not in suffixes:
         what = "an animation" if moves else "a picture"
         raise ValueError(f"--out {args.out}: {what} is {' or '.join(suffixes)}")
     if args.frames is not None and (poses > 1 or not moves):
-        raise ValueError("--frames: of --turntable, --turning-light or --sway")
+        raise ValueError("--frames needs --turntable, --turning-light or --sway")
     if not moves:
         return
     if args.field == "interpolation":
-        raise ValueError("an animation shows the model or its field, not --field interpolation")
+        raise ValueError("an animation cannot be combined with --field interpolation")
     turns = args.turntable or args.turning_light
     if poses and (turns or args.sway is not None):
-        raise ValueError(
-            "--strands of other poses goes without --turntable, --turning-light and --sway"
-        )
+        raise ValueError("--strands cannot be combined with --turntable, --turning-light or --sway")
     if turns and (args.light or args.camera):
         raise ValueError(
-            "--turntable and --turning-light are under a map: without --light and --camera"
+            "--turntable and --turning-light cannot be combined with --light or --camera"
         )
     if args.frames is not None and not 2 <= args.frames <= 1000:
         raise ValueError(f"--frames {args.frames}: expected 2 to 1000")
@@ -205,7 +208,7 @@ def _animate(
     out: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write the animation that was asked for; what there is to tell of it."""
+    """Write the animation; returns its figures."""
     from appearance.model.animation import (
         moving,
         sway,
@@ -228,12 +231,12 @@ def _animate(
 
 def _still(
     args: argparse.Namespace,
-    whose: tuple[FittedModel, Model, Capture | None],
+    sources: tuple[FittedModel, Model, Capture | None],
     strands: Strands | None,
     lit: tuple[Camera, Sequence[Light], Sequence[Environment], Sampling],
     progress: Progress,
 ) -> tuple[Floats, dict[str, Any]]:
-    """One picture, and what there is to tell of it."""
+    """One image, and its figures."""
     from appearance import render_mixed
     from appearance.model.interpolated import (
         GuidedFrames,
@@ -242,7 +245,7 @@ def _still(
         all_lights,
     )
 
-    fitted, model, capture = whose
+    fitted, model, capture = sources
     pose = Pose(fitted, strands)
     progress("rendering", 0.2)
     image = render_mixed(fitted.scene(pose.strands), *lit)
@@ -261,15 +264,15 @@ def _still(
 def _interpolated(
     image: Floats,
     options: InterpolationOptions,
-    whose: tuple[Pose, Model, Capture],
+    sources: tuple[Pose, Model, Capture],
     lit: tuple[Camera, Sequence[Light]],
     progress: Progress,
 ) -> tuple[Floats, dict[str, Any]]:
-    """The picture with its hair from captured frames, and what there is to tell of it."""
+    """The image with its hair from captured frames, and its figures."""
     from appearance.model.interpolated import interpolation_of, with_samples
     from reconstruction import Stage
 
-    pose, model, capture = whose
+    pose, model, capture = sources
     stage = Stage("interpolation")
     interpolation = interpolation_of(
         pose.fitted,
@@ -279,11 +282,13 @@ def _interpolated(
         options=options,
         progress=lambda what, share: progress(what, 0.5 + 0.4 * share),
     )
-    image, told = with_samples(image, interpolation, pose, *lit)
-    if told["hair_unseen"] > 0.01:
-        stage.warn(f"{told['hair_unseen']:.0%} of the hair was seen by no camera: it is rendered")
+    image, figures = with_samples(image, interpolation, pose, *lit)
+    if figures["hair_unseen"] > 0.01:
+        stage.warn(
+            f"{figures['hair_unseen']:.0%} of the hair is visible to no camera: it is rendered"
+        )
     return image, {
-        **told,
+        **figures,
         "field": "interpolation",
         "guide": stage.figures,
         "warnings": stage.warnings,

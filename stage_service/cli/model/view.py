@@ -13,17 +13,19 @@ def add(commands: Commands) -> None:
     """Add the command."""
     view = add_command(commands, "view", run)
     view.add_argument("model", type=Path)
-    view.add_argument("--capture", type=Path, help="the capture that it was made of")
-    view.add_argument("--truth", type=Path, help="a strand file to show beside the model's strands")
+    view.add_argument("--capture", type=Path, help="the model's capture")
+    view.add_argument(
+        "--truth", type=Path, help="a strand file to compare the model's strands with"
+    )
     view.add_argument("--port", type=int, default=0, help="0 takes any free port")
 
 
 def run(args: argparse.Namespace, output: Output) -> None:
-    """A model in a browser: its strands turn under your hand.
+    """View a model in a browser.
 
     Serve MODEL to a browser on this machine until Ctrl-C: strands by direction, confidence, root,
-    length or lit; with --capture its cameras and photographs, and any light out of captured frames.
-    The address that is printed holds a key: who has it sees the model.
+    length or lit; with --capture its cameras and frames, and relighting by sums of OLAT frames. The
+    printed address contains a key: anyone who has it can view the model.
     """
     import secrets
 
@@ -38,15 +40,15 @@ def run(args: argparse.Namespace, output: Output) -> None:
     model = Model(args.model)
     if not model.has("strands.npz"):
         raise BadArgument(
-            f"{args.model} has no strands.npz: name a model folder, as 'hairstage reconstruct' or "
-            "'hairstage demo' makes it"
+            f"{args.model} has no strands.npz: name a model folder made by 'hairstage reconstruct' "
+            "or 'hairstage demo'"
         )
     capture = None if args.capture is None else Capture(args.capture)
     truth = None if args.truth is None else read_strands(args.truth)
     name = args.model.resolve().name
     decoder = Decoder()
     viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth), decoder)
-    viewing.get(name).about()  # read now: the browser then waits for nothing
+    viewing.get(name).about()  # read before the browser opens
     key = secrets.token_urlsafe(24)
 
     def ready(url: str) -> None:
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         output.result({"url": address, "model": str(args.model)}, f"{address}\n(Ctrl-C ends it)")
 
     exit_on_sigterm()
-    access = Access(Tokens(args.model / "none", key))  # a key for this run alone
+    access = Access(Tokens(args.model / "none", key))  # a key for this run
     try:
         serve_viewer(viewing, access, args.port, ready)
     finally:

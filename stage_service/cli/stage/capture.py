@@ -13,18 +13,18 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_group,
-    add_remote,
     in_url,
     progress_bar,
     read_json,
     rig_path,
 )
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
 
 
-PLAN = "plan as JSON; without it, everything"
+PLAN = "plan as JSON; default: all lights and projectors"
 
 
 def add(commands: Commands) -> None:
@@ -32,16 +32,26 @@ def add(commands: Commands) -> None:
     capture = add_group(commands, "capture", "make and steer captures on a running service")
     check = add_remote(capture, "check", run_check)
     start = add_remote(capture, "start", run_start)
-    check.add_argument("--rig", type=rig_path, help="ask this rig file, not a service")
+    check.add_argument(
+        "--rig", type=rig_path, help="check against this rig file instead of a service"
+    )
     check.add_argument("--plan", type=Path, help=PLAN)
-    add_wanted(start)
-    start.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
-    start.add_argument("--wait", action="store_true", help="wait for capture and job, steer alone")
+    add_requested(start)
+    start.add_argument(
+        "--armed-by",
+        help="who at the stage is responsible for flashes that the plan has consent for",
+    )
+    start.add_argument(
+        "--wait", action="store_true", help="hold the lease, and wait for the capture and its job"
+    )
     add_remote(capture, "list", run_list_captures)
     for action, what in (
-        ("show", "show where a capture is"),
+        ("show", "show a capture's state"),
         ("pause", "pause at the next step"),
-        ("resume", "go on after a pause; shoot what an aborted or failed capture lacks"),
+        (
+            "resume",
+            "resume after a pause; shoot the frames that an aborted or failed capture lacks",
+        ),
         ("abort", "abort at the next step, lights off"),
     ):
         parser = add_remote(capture, action, run_capture_action, what)
@@ -50,17 +60,17 @@ def add(commands: Commands) -> None:
             parser.add_argument("--armed-by", help="as for start")
 
 
-def add_wanted(parser: argparse.ArgumentParser) -> None:
-    """Add what says which capture is wanted."""
+def add_requested(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a capture: plan, head, masks, pipeline."""
     parser.add_argument("--plan", type=Path, help=PLAN)
     parser.add_argument("--head", type=Path, help="the digitised head (.obj)")
     parser.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
-    parser.add_argument("--upload", help="a subject whose head and masks were uploaded")
+    parser.add_argument("--upload", help="name of a subject whose head and masks were uploaded")
     add_pipeline(parser, None, "job to enqueue when the capture completes")
 
 
-def wanted(args: argparse.Namespace) -> dict[str, Any]:
-    """The request that `add_wanted`'s options make."""
+def requested(args: argparse.Namespace) -> dict[str, Any]:
+    """The request body made of `add_requested`'s options."""
     body: dict[str, Any] = {"plan": read_json(args.plan)}
     for field in ("head", "masks"):
         if getattr(args, field) is not None:
@@ -68,14 +78,14 @@ def wanted(args: argparse.Namespace) -> dict[str, Any]:
     if args.upload is not None:
         body["upload"] = args.upload
     if args.options is not None and args.pipeline is None:
-        raise BadArgument("--options are a job's: say which with --pipeline")
+        raise BadArgument("--options are those of a pipeline: name it with --pipeline")
     if args.pipeline is not None:
         body["pipeline"] = {"name": args.pipeline, "options": read_json(args.options)}
     return body
 
 
 def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Cost a plan without lighting a lamp."""
+    """Cost a plan; lights no lamp."""
     if args.rig is not None:
         from reconstruction import parse_options
         from stage_service.config import load_rig_file
@@ -90,7 +100,7 @@ def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) 
 
 
 def _costed(cost: dict[str, Any]) -> str:
-    """A plan's cost, for people."""
+    """A plan's cost as text."""
     flash = cost["flash"]
     kinds = ", ".join(f"{n} {kind}" for kind, n in cost["frames_by_kind"].items())
     causes = ", ".join(f"{c} {s:.1f}" for c, s in cost["seconds_by_cause"].items() if s)
@@ -109,13 +119,13 @@ def _costed(cost: dict[str, Any]) -> str:
         f"light: {cost['lamp_seconds']:.1f} lamp seconds, "
         f"{', '.join(f'{d:.3g}' for d in cost['dose'])} J/m² (R, G, B) at the head",
     ]
-    lines += [f"left out: {x['what']}: {x['why']}" for x in cost["left_out"]]
+    lines += [f"skipped: {x['what']}: {x['why']}" for x in cost["left_out"]]
     return "\n".join(lines)
 
 
 def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
     """Begin a capture."""
-    body = wanted(args)
+    body = requested(args)
     if args.armed_by is not None:
         body["armed_by"] = args.armed_by
     if not args.wait:
@@ -144,7 +154,9 @@ def run_list_captures(args: argparse.Namespace, output: Output, service: Service
     ]
     output.result({"captures": captures}, "\n".join(lines) or "no captures")
     if unread := service.get("/health")["unread"]:
-        output.note(f"{unread:,} more are still being read: the service has just started")
+        output.note(
+            f"{unread:,} captures are not listed: the service has just started and is reading them"
+        )
 
 
 def run_capture_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:

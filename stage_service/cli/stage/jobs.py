@@ -10,11 +10,11 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_group,
-    add_remote,
     in_url,
     progress_bar,
     read_json,
 )
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -26,11 +26,11 @@ def add(commands: Commands) -> None:
     submit = add_remote(jobs, "submit", run_submit)
     submit.add_argument("capture", help="the capture's id")
     add_pipeline(submit, "light_planes", "the steps to run")
-    submit.add_argument("--model", help="name of the model folder; without it, a new one")
+    submit.add_argument("--model", help="name of the model folder; default: a new one")
     submit.add_argument("--wait", action="store_true", help="wait until the job is done")
     add_remote(jobs, "list", run_list_jobs)
     for action, what in (
-        ("show", "show where a job is"),
+        ("show", "show a job's state"),
         ("wait", "wait until a job is done"),
         ("cancel", "cancel a job"),
         ("report", "print a job's report"),
@@ -69,7 +69,7 @@ def run_list_jobs(args: argparse.Namespace, output: Output, service: ServiceClie
 
 
 def run_job_action(args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Show, wait for, cancel, or read what a job left."""
+    """Show, wait for or cancel a job, or print its report or files."""
     path = f"/jobs/{in_url(args.job)}"
     if args.action == "wait":
         return wait_for_job(service, args.job, output, {})
@@ -80,12 +80,12 @@ def run_job_action(args: argparse.Namespace, output: Output, service: ServiceCli
     elif args.action == "report":
         output.result(service.get(f"{path}/report"))
     else:
-        output.result(service.ask("DELETE" if args.action == "cancel" else "GET", path))
+        output.result(service.request("DELETE" if args.action == "cancel" else "GET", path))
     return 0
 
 
 def wait_for_job(service: ServiceClient, job: str, output: Output, more: dict[str, Any]) -> int:
-    """Follow a job to its end and print it with what else `more` has; returns the exit code."""
+    """Follow a job to its end and print it together with `more`; returns the exit code."""
     with progress_bar("job") as progress:
         done = service.follow_job(job, progress)
     why = f": {done['error']['detail']}" if done["error"] else ""

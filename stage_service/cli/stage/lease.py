@@ -1,11 +1,12 @@
-"""`hairstage lease`: steer a stage alone for some time."""
+"""`hairstage lease`: exclusive control of a stage for some time."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from stage_service.cli.support.commands import Commands, Output, add_group, add_remote
+from stage_service.cli.support.commands import Commands, Output, add_group
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -13,15 +14,17 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add the commands."""
-    lease = add_group(commands, "lease", "steer a stage alone for some time")
+    lease = add_group(commands, "lease", "take, renew and release exclusive control of a stage")
     take = add_remote(lease, "take", run_take_lease)
-    take.add_argument("--holder", help="in whose name; without it, this user and machine")
+    take.add_argument("--holder", help="name of the holder; default: this user and machine")
     take.add_argument("--seconds", type=float, default=600.0)
     add_remote(lease, "show", run_show_lease)
     renew = add_remote(lease, "renew", run_renew_lease)
     renew.add_argument("--seconds", type=float, default=600.0, help="from now")
     release = add_remote(lease, "release", run_release_lease)
-    release.add_argument("--force", action="store_true", help="whoever holds it; as admin")
+    release.add_argument(
+        "--force", action="store_true", help="end somebody else's lease; needs the scope admin"
+    )
 
 
 def run_take_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
@@ -33,18 +36,20 @@ def run_take_lease(args: argparse.Namespace, output: Output, service: ServiceCli
 
 
 def run_show_lease(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Show who steers, and until when."""
+    """Show the holder of the lease and its end."""
     held = service.get("/lease")
-    text = f"{held['holder']} until {held['expires']}" if held["holder"] else "nobody: anybody may"
+    text = (
+        f"{held['holder']} until {held['expires']}" if held["holder"] else "nobody holds the lease"
+    )
     output.result(held, text)
 
 
 def run_renew_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Let the lease of --lease end later."""
-    granted = service.ask("PATCH", "/lease", json={"seconds": args.seconds})
+    """Extend the lease given by --lease."""
+    granted = service.request("PATCH", "/lease", json={"seconds": args.seconds})
     output.result(granted, f"until {granted['expires']}")
 
 
 def run_release_lease(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """End the lease of --lease."""
-    output.result(service.ask("DELETE", f"/lease?force={args.force}"), "released")
+    """Release the lease given by --lease."""
+    output.result(service.request("DELETE", f"/lease?force={args.force}"), "released")

@@ -36,45 +36,65 @@ def add(commands: Commands) -> None:
     """Add the commands."""
     serve = add_command(commands, "serve", run_serve)
     serve.add_argument("--rig", type=rig_path, required=True, help=RIG_HELP)
-    serve.add_argument("--devices", type=Path, help="file whose [devices] wins over the rig file's")
-    serve.add_argument("--root", type=Path, default=Path("runs/stage"), help="captures and models")
+    serve.add_argument("--devices", type=Path, help="file whose [devices] overrides the rig file's")
+    serve.add_argument(
+        "--root", type=Path, default=Path("runs/stage"), help="folder of captures and models"
+    )
     serve.add_argument(
         "--port", type=whole(0, 65535), default=DEFAULT_PORT, help="0 takes any free port"
     )
-    serve.add_argument("--host", default="127.0.0.1", help="address; beyond this machine with TLS")
-    serve.add_argument("--socket", type=Path, help="a Unix socket instead, for user and group")
-    serve.add_argument("--tls-cert", type=Path, help="certificate and what leads to it, PEM")
-    serve.add_argument("--tls-key", type=Path, help="its key, where that file lacks it")
-    serve.add_argument("--name", action="append", default=[], help="a host name of this service")
     serve.add_argument(
-        "--verify-days", type=float, help="read each capture again so often, beside all else"
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; other than this machine's needs TLS",
     )
     serve.add_argument(
-        "--take-over", action="store_true", help="the service that has the stage is dead"
+        "--socket", type=Path, help="Unix socket instead of a port, for user and group"
+    )
+    serve.add_argument("--tls-cert", type=Path, help="certificate chain, PEM")
+    serve.add_argument("--tls-key", type=Path, help="private key, if not in the certificate's file")
+    serve.add_argument(
+        "--name", action="append", default=[], help="a further host name of this service"
     )
     serve.add_argument(
-        "--no-auth", action="store_true", help="everybody on this machine may do everything"
+        "--verify-days",
+        type=float,
+        help="verify each capture against its checksums every so many days",
     )
     serve.add_argument(
-        "--gpu-workers", action="store_true", help="what renders waits for a 'worker --gpu'"
+        "--take-over", action="store_true", help="take the stage from a service that has died"
+    )
+    serve.add_argument(
+        "--no-auth", action="store_true", help="grant all scopes to everybody on this machine"
+    )
+    serve.add_argument(
+        "--gpu-workers", action="store_true", help="queue rendering jobs for a 'worker --gpu'"
     )
 
     worker = add_command(commands, "worker", run_worker)
-    worker.add_argument("--root", type=Path, default=Path("runs/stage"), help="as the service's")
+    worker.add_argument(
+        "--root", type=Path, default=Path("runs/stage"), help="the service's root folder"
+    )
     worker.add_argument("--concurrency", type=whole(1), default=1, help="jobs at the same time")
     worker.add_argument(
-        "--gpu", action="store_true", help="the jobs that 'serve --gpu-workers' keeps for a GPU"
+        "--gpu",
+        action="store_true",
+        help="run the jobs that 'serve --gpu-workers' queues for a GPU",
     )
-    worker.add_argument("--take-over", metavar="HOST", help="that machine's workers are dead")
+    worker.add_argument(
+        "--take-over",
+        metavar="HOST",
+        help="take over the jobs of a machine whose workers have died",
+    )
 
     for process in (serve, worker):
-        process.add_argument("--log-json", action="store_true", help="a JSON object for each line")
+        process.add_argument("--log-json", action="store_true", help="log one JSON object a line")
 
     simulate = add_command(commands, "simulate", run_simulate)
     add_subject(simulate)
     simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
-    simulate.add_argument("--truth", type=Path, help="write the true strands and appearance here")
-    simulate.add_argument("--faults", type=Path, help="faults to inject")
+    simulate.add_argument("--truth", type=Path, help="folder for the true strands and appearance")
+    simulate.add_argument("--faults", type=Path, help="JSON list of faults to inject")
     simulate.add_argument(
         "--ports", choices=("auto", "rig"), default="auto", help="free TCP ports, or the rig file's"
     )
@@ -84,9 +104,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     """Run the service: devices, captures and the HTTP API.
 
     Run the service for one rig on 127.0.0.1. SIGTERM and Ctrl-C put the lights off first. With
-    --json, one object with the URL is printed when requests are answered. Who asks sends a token:
-    the commands send this user's own, which is made where there is none; 'hairstage token' makes
-    others.
+    --json, one object with the URL is printed when the service is ready. Requests need a token: the
+    commands send this user's, which is created on first use; 'hairstage token' makes others.
     """
     log_to_stderr(args.log_json)
     from stage_service.api.app import Endpoint, serve
@@ -101,8 +120,8 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     endpoint = Endpoint(args.host.strip("[]"), args.port, args.socket, args.tls_cert, args.tls_key)
     if not endpoint.local and (args.no_auth or args.tls_cert is None):
         raise BadArgument(
-            f"--host {args.host}: beyond this machine tokens are asked for and must not be "
-            "overheard: leave out --no-auth, and give --tls-cert and --tls-key"
+            f"--host {args.host}: requests from other machines need tokens and TLS: "
+            "leave out --no-auth, and give --tls-cert and --tls-key"
         )
     if args.verify_days is not None and not 0 < args.verify_days <= 10_000:
         expected = "days above 0 and at most 10,000"
@@ -122,11 +141,12 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
         raise CommandError(str(error), UNREACHABLE, "StageInUse") from error
     except RootInUse:
         raise
-    except OSError as error:  # a disk that went read-only, say: lamps may be on all the same
+    except OSError as error:  # e.g. a read-only disk: lamps may still be on
         off = put_off(rig_file, args.root, take_over=args.take_over)
         raise CommandError(
-            f"--root {args.root}: {error}: give another, or free this one. As no service can run, "
-            f"lamps and projectors were to be put off: {off}"
+            f"--root {args.root}: {error}: choose another folder, or make this one writable. No "
+            "service "
+            f"runs; lamps and projectors were commanded off: {off}"
         ) from error
 
     access = _access(args, {endpoint.name, *args.name}, output)
@@ -140,10 +160,10 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
 
 
 def _check_certificate(args: argparse.Namespace) -> None:
-    """Raise `BadArgument` for one that cannot be used, before any device is asked."""
+    """Raise `BadArgument` for a certificate that cannot be used, before a device is opened."""
     if args.tls_cert is None:
         if args.tls_key is not None:
-            raise BadArgument("--tls-key is of no use without --tls-cert")
+            raise BadArgument("--tls-key needs --tls-cert")
         return
     for file in filter(None, (args.tls_cert, args.tls_key)):
         if not file.is_file():
@@ -165,23 +185,25 @@ def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access
 
     names = OWN_NAMES | {name.lower() for name in named}
     if args.no_auth:
-        output.note("no tokens are asked for: everybody on this machine may do everything")
+        output.note("no tokens are required: everybody on this machine has all scopes")
         return Access(None, names)
     try:
         own = own_token()
         output.note(f"requests need a token; yours is in {own_file()} (hairstage token show)")
     except OSError as error:
         own = None
-        output.note(f"you have no token of your own here ({error}): make one by 'hairstage token'")
+        output.note(
+            f"no token of yours can be stored here ({error}): make one with 'hairstage token make'"
+        )
     return Access(Tokens(args.root / TOKENS, own), names, Logins(args.root))
 
 
 def run_worker(args: argparse.Namespace, output: Output) -> None:
-    """Run a worker: takes jobs off the queue.
+    """Run a worker, which takes jobs off the queue.
 
-    Run the jobs of one root folder. A worker that dies leaves its job to the next, or another, of
-    this machine, which goes on at the step that was under way. Workers of several machines mount
-    the root and share a PostgreSQL database, $HAIRSTAGE_DATABASE_URL.
+    Run the jobs of one root folder. If a worker dies, another worker of this machine resumes its
+    job at the interrupted step. Workers on several machines mount the root and share a PostgreSQL
+    database, $HAIRSTAGE_DATABASE_URL.
     """
     log_to_stderr(args.log_json)
     from reconstruction.array_backend import VARIANT, prefer_cuda
@@ -199,17 +221,16 @@ def run_worker(args: argparse.Namespace, output: Output) -> None:
         gpu=args.gpu,
         take_over=args.take_over,
         ready=lambda name: output.result(
-            {"worker": name, "root": str(args.root)}, f"{name} works on the jobs of {args.root}"
+            {"worker": name, "root": str(args.root)}, f"{name} runs the jobs of {args.root}"
         ),
     )
 
 
 def run_simulate(args: argparse.Namespace, output: Output) -> int:
-    """Run a simulated rig behind the same wires as a real one.
+    """Run a simulated rig with the wire protocols of a real one.
 
-    Run the device side of every wire. STATE/devices.toml is written when they answer: give it to
-    'hairstage serve --devices'. To calibrate, SUBJECT is board:N, mirror:N or diffuse:N, in pose or
-    place N.
+    When the devices are ready, STATE/devices.toml is written for 'hairstage serve --devices'. To
+    calibrate, SUBJECT is board:N, mirror:N or diffuse:N, in pose or place N.
     """
     from stage_service.cli.support.children import Children, SimulatedRig
 
@@ -220,10 +241,10 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
             more += [f"--{option}", getattr(args, option)]
     simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed)
     with Children(args.state / "logs") as children:
-        child = children.start("simulators", simulated.command(*more), to_log=False, answers=True)
+        child = children.start("simulators", simulated.command(*more), to_log=False, pipe=True)
         devices = children.first_line("simulators", child, 600)["devices"]
-        output.result({"devices": devices}, f"the simulated rig answers; see {devices}")
-        while (code := child.poll()) is None:  # a signal may come just before a sleep: a short one
+        output.result({"devices": devices}, f"the simulated rig is ready; its devices: {devices}")
+        while (code := child.poll()) is None:  # short: a signal may come just before it
             time.sleep(0.2)
         return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
 
@@ -232,7 +253,7 @@ SUBJECTS = ("wavy", "straight", "curly")
 
 
 def add_subject(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which subject sits in which rig."""
+    """Add the options of rig and subject."""
     parser.add_argument("--rig", type=rig_path, default="demo", help=RIG_HELP)
     names = ", ".join(SUBJECTS)
     parser.add_argument("--subject", default="wavy", help=f"{names} or a strand file")
@@ -251,8 +272,7 @@ def exit_on_sigterm() -> None:
 
 
 def log_to_stderr(as_json: bool = False) -> None:
-    """Log records of level INFO and above go to stderr; of the job database's libraries, those of
-    its being away are counted alone."""
+    """Log to stderr from level INFO; repeated connection errors of the job database are counted."""
     from stage_service.jobs.queue import LIBRARIES
     from stage_service.records.logs import JsonLines
 

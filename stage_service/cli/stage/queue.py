@@ -1,12 +1,13 @@
-"""`hairstage queue`: captures that wait for the stage of a running service."""
+"""`hairstage queue`: queued captures of a running service."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from stage_service.cli.stage.capture import add_wanted, wanted
-from stage_service.cli.support.commands import Commands, Output, add_group, add_remote, in_url
+from stage_service.cli.stage.capture import add_requested, requested
+from stage_service.cli.support.commands import Commands, Output, add_group, in_url
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -14,12 +15,10 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add the commands."""
-    queue = add_group(
-        commands, "queue", "captures that wait for the stage, and begin by themselves"
-    )
+    queue = add_group(commands, "queue", "captures that start when the stage is free")
     added = add_remote(queue, "add", run_add)
-    add_wanted(added)
-    added.add_argument("--place", type=int, help="where, from 0; without it, at the end")
+    add_requested(added)
+    added.add_argument("--place", type=int, help="position, from 0; default: the end")
     add_remote(queue, "list", run_list_queue)
     add_remote(queue, "history", run_history)
     moved = add_remote(queue, "move", run_move)
@@ -27,65 +26,71 @@ def add(commands: Commands) -> None:
     started = add_remote(queue, "start", run_start_one)
     for parser in (moved, removed, started):
         parser.add_argument("entry", help="its id")
-    moved.add_argument("place", type=int, help="where, from 0")
-    started.add_argument("--armed-by", help="who answers for flashes that the plan has consent for")
+    moved.add_argument("place", type=int, help="position, from 0")
+    started.add_argument(
+        "--armed-by",
+        help="who at the stage is responsible for flashes that the plan has consent for",
+    )
     add_remote(queue, "hold", run_hold)
     add_remote(queue, "go-on", run_go_on)
 
 
 def run_add(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Let a capture wait for the stage."""
-    body = wanted(args)
+    """Queue a capture."""
+    body = requested(args)
     if args.place is not None:
         body["place"] = args.place
     entry = service.post("/queue", body)
-    output.result(entry, f"{entry['id']} waits")
+    output.result(entry, f"{entry['id']} is queued")
 
 
 def run_list_queue(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """List what waits, the next one first, and what it waits for."""
+    """List the queued captures, the next one first, and why the first is waiting."""
     _show(service.get("/queue"), output)
 
 
 def run_history(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """List what was started from the queue, or removed; the newest first."""
+    """List captures that were started or removed, the newest first."""
     entries = service.get("/queue/history")
     lines = [f"{e['id']}  {e['state']}  {e['capture'] or ''}  {e['ended']}" for e in entries]
     output.result({"history": entries}, "\n".join(lines) or "nothing yet")
 
 
 def run_move(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Put what waits at another place."""
-    output.result(service.ask("PATCH", f"/queue/{in_url(args.entry)}", json={"place": args.place}))
+    """Move a queued capture to another position."""
+    output.result(
+        service.request("PATCH", f"/queue/{in_url(args.entry)}", json={"place": args.place})
+    )
 
 
 def run_remove(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Take out what waits."""
-    output.result(service.ask("DELETE", f"/queue/{in_url(args.entry)}"))
+    """Remove a queued capture."""
+    output.result(service.request("DELETE", f"/queue/{in_url(args.entry)}"))
 
 
 def run_start_one(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Start what waits now, out of turn.
+    """Start a queued capture now, out of order.
 
-    The only way for a plan that flashes: --armed-by says who at the stage answers for it.
+    The only way for a plan that flashes: --armed-by names the person at the stage who is
+    responsible.
     """
     started = service.post(f"/queue/{in_url(args.entry)}/start", {"armed_by": args.armed_by})
     output.result(started, f"capture {started['capture']} runs")
 
 
 def run_hold(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Begin nothing by itself any more.
+    """Hold the queue: no queued capture starts.
 
-    A start of the service, a blackout, an abort, a capture that does not complete and a jump of the
-    clock do the same.
+    The queue is also held after a start of the service, a blackout, an abort, an incomplete capture
+    and a jump of the clock.
     """
     _show(service.post("/queue:hold"), output)
 
 
 def run_go_on(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Begin what waits again; prints why the queue was held.
+    """Release the queue; prints why it was held.
 
-    Where something happens meanwhile the queue stays held: read why, and say it again.
+    If another reason to hold it appears meanwhile, it stays held: read the reason and repeat.
     """
     queue = service.get("/queue")
     if queue["hold"] is not None:
@@ -99,5 +104,5 @@ def _show(queue: dict[str, Any], output: Output) -> None:
     if queue["held"]:
         lines.append(f"held: {queue['held']}")
     if queue["waits_for"] and not queue["waits_for"].startswith("held: "):
-        lines.append(f"waits for: {queue['waits_for']}")
-    output.result(queue, "\n".join(lines) or "nothing waits")
+        lines.append(f"waiting for: {queue['waits_for']}")
+    output.result(queue, "\n".join(lines) or "the queue is empty")

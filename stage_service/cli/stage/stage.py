@@ -1,11 +1,12 @@
-"""`hairstage stage`: whether it is dark, and how to make it so."""
+"""`hairstage stage`: state of the lamps, and blackout."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from stage_service.cli.support.commands import FAILED, Commands, Output, add_group, add_remote
+from stage_service.cli.support.commands import FAILED, Commands, Output, add_group
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -13,24 +14,24 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Add the commands."""
-    stage = add_group(commands, "stage", "see whether a stage is dark, and make it so")
+    stage = add_group(commands, "stage", "show whether a stage is dark, and black it out")
     add_remote(stage, "status", run_status)
     add_remote(stage, "blackout", run_blackout)
     acknowledge = add_remote(stage, "acknowledge", run_acknowledge)
-    acknowledge.add_argument("name", metavar="NAME", help="who has looked")
-    acknowledge.add_argument("note", metavar="NOTE", help="what they saw")
+    acknowledge.add_argument("name", metavar="NAME", help="who inspected the stage")
+    acknowledge.add_argument("note", metavar="NOTE", help="what was observed")
 
 
 def run_status(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Show how service, lamps and jobs are.
+    """Show the state of service, lamps and jobs.
 
-    As `GET /health` has it: "ok", "degraded" (with what is wrong) or "unsafe": a blackout has
-    failed, and nothing may be lit until that is over. What is known of the lamps stands beside it:
-    unknown, too, during a blackout and where the light bank cannot read back.
+    As `GET /health`: "ok", "degraded" (with the problems) or "unsafe": a blackout has failed, and
+    no lamp may be lit until it is resolved. The lamps' state is unknown during a blackout, and with
+    a light bank that cannot read back.
     """
     health = service.get("/health")
     doing = f"capture {health['capture']} runs" if health["capture"] else "no capture runs"
-    worker = "a worker is there" if health["worker"] else "no worker is there"
+    worker = "a worker runs" if health["worker"] else "no worker runs"
     lines = [f"{health['status']}: lamps {health['lamps']}, {doing}, {worker}", *health["problems"]]
     if health["latch"] is None and health["lamps"] not in ("dark", "in use"):
         lines.append(health["lamps_detail"])
@@ -38,9 +39,9 @@ def run_status(_args: argparse.Namespace, output: Output, service: ServiceClient
 
 
 def run_blackout(_args: argparse.Namespace, output: Output, service: ServiceClient) -> int:
-    """Put all lamps and projectors off, and say whether they are.
+    """Put all lamps and projectors off, and report whether they are.
 
-    Aborts a running capture. Exit code 1 where nobody knows whether they are off.
+    Aborts a running capture. Exit code 1 if the result is unverified.
     """
     result = service.post("/devices/blackout")
     output.result(result, f"{result['state']}: {result['detail']}")
@@ -48,9 +49,9 @@ def run_blackout(_args: argparse.Namespace, output: Output, service: ServiceClie
 
 
 def run_acknowledge(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Say that somebody has looked: the lamps are off.
+    """Record that a person has seen the lamps dark.
 
-    Only where the link cannot tell by itself; elsewhere a blackout does.
+    Only for light banks that cannot read back; for others a blackout verifies it.
     """
     body = {"name": args.name, "note": args.note}
-    output.result(service.post("/devices/acknowledge", body), "said, and in the audit log")
+    output.result(service.post("/devices/acknowledge", body), "recorded in the audit log")

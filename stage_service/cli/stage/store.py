@@ -1,4 +1,4 @@
-"""`hairstage store`: what lies under the root folder of a running service."""
+"""`hairstage store`: captures, models, trash and uploads of a running service."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_group,
-    add_remote,
     in_url,
     progress_bar,
 )
+from stage_service.cli.support.remote import add_remote
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -31,26 +31,32 @@ def add(commands: Commands) -> None:
     for parser in (download, remove):
         parser.add_argument("kind", choices=KINDS)
         parser.add_argument("name", help="its id, or name")
-    download.add_argument("--out", type=Path, help="file; without it, NAME.tar")
+    download.add_argument("--out", type=Path, help="file; default: NAME.tar")
     add_remote(store, "trash", run_trash)
-    add_remote(store, "restore", run_restore).add_argument("name", help="as 'trash' lists it")
+    add_remote(store, "restore", run_restore).add_argument(
+        "name", help="name in the trash, see 'trash'"
+    )
     empty = add_remote(store, "empty", run_empty)
     empty.add_argument("--older-than-days", type=float, default=30.0)
     for parser in (remove, empty):
-        parser.add_argument("--dry-run", action="store_true", help="only say what would go")
+        parser.add_argument(
+            "--dry-run", action="store_true", help="only list what would be removed"
+        )
     verify = add_remote(store, "verify", run_verify)
     verify.add_argument("capture", help="its id")
-    verify.add_argument("--show", action="store_true", help="ask for nothing, show what was found")
+    verify.add_argument(
+        "--show", action="store_true", help="show the last result, start no verification"
+    )
     upload = add_remote(store, "upload", run_upload)
-    upload.add_argument("subject", help="a name; captures name it with --upload")
+    upload.add_argument("subject", help="name of the subject, for --upload of captures")
     upload.add_argument("--head", type=Path, help="the digitised head (.obj)")
     upload.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
 
 
 def run_download(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Fetch all files of a capture or a model as a tar file.
+    """Download all files of a capture or a model as a tar file.
 
-    Goes on where it broke off, as long as nothing there has changed.
+    Resumes a broken download if no file has changed.
     """
     out = args.out or Path(f"{args.name}.tar")
     with progress_bar("download") as progress:
@@ -59,33 +65,33 @@ def run_download(args: argparse.Namespace, output: Output, service: ServiceClien
 
 
 def run_remove(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Put a capture or a model into the trash."""
+    """Move a capture or a model to the trash."""
     path = f"/{args.kind}s/{in_url(args.name)}?dry_run={args.dry_run}"
-    found = service.ask("DELETE", path)
-    told = "would go into the trash" if args.dry_run else f"is in the trash as {found['name']}"
+    found = service.request("DELETE", path)
+    done = "would go into the trash" if args.dry_run else f"is in the trash as {found['name']}"
     stay = f"; its models stay: {', '.join(found['models'])}" if found["models"] else ""
-    output.result(found, f"{args.kind} {args.name}, {found['bytes']:,} bytes, {told}{stay}")
+    output.result(found, f"{args.kind} {args.name}, {found['bytes']:,} bytes, {done}{stay}")
 
 
 def run_trash(_args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """List what was removed and can be had again."""
+    """List the trash."""
     _list(service.get("/trash"), output, "the trash is empty")
 
 
 def run_restore(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Put something back from the trash, as admin."""
+    """Restore an entry of the trash; needs the scope admin."""
     found = service.post(f"/trash/{in_url(args.name)}/restore")
-    output.result(found, f"{found['kind']} {found['id']} is back")
+    output.result(found, f"{found['kind']} {found['id']} is restored")
 
 
 def run_empty(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Delete for good what was removed long ago, as admin."""
+    """Delete old entries of the trash for good; needs the scope admin."""
     query = f"older_than_days={args.older_than_days}&dry_run={args.dry_run}"
-    _list(service.ask("DELETE", f"/trash?{query}"), output, "nothing is that old")
+    _list(service.request("DELETE", f"/trash?{query}"), output, "nothing is that old")
 
 
 def run_verify(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Have the service read every file of a capture again, beside all else."""
+    """Verify every file of a capture against its checksum, on the service."""
     if args.show:
         found = service.get(f"/captures/{in_url(args.capture)}/verification")
     else:
@@ -101,11 +107,11 @@ def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient)
     files |= {f"masks/{mask.name}": mask for mask in masks}
     if not files or (args.masks is not None and not masks):
         raise BadArgument("nothing to upload: give --head, or --masks with <camera>.png in it")
-    kept: dict[str, Any] = {}
+    stored: dict[str, Any] = {}
     for name, file in files.items():
         path = f"/uploads/{in_url(args.subject)}/{quote(name)}"
-        kept = service.ask("PUT", path, content=file.read_bytes())
-    output.result(kept, f"{args.subject}: {', '.join(kept['files'])}")
+        stored = service.request("PUT", path, content=file.read_bytes())
+    output.result(stored, f"{args.subject}: {', '.join(stored['files'])}")
 
 
 def _list(found: list[dict[str, Any]], output: Output, nothing: str) -> None:

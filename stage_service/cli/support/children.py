@@ -1,4 +1,4 @@
-"""Child processes that never outlive the command that started them."""
+"""Child processes that end with the command that started them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from stage_service.cli.support.commands import BAD_INPUT, UNREACHABLE, CommandEr
 from stage_service.signals import held, tied
 
 GRACE_S = 20.0
-"""How long a child may take to end by itself: the service puts the lights off in that time."""
+"""Seconds that a child has to end by itself; the service puts the lights off in that time."""
 
 
 class Children:
     """Starts processes and ends them on every exit of its with-block, the latest first.
 
-    Each child's output goes to `logs/<name>.log`, unless it is asked for. They are `tied`: to be
-    started by a thread that lives as long as they shall.
+    Each child's output goes to `logs/<name>.log`. Children are `tied`: the thread that starts them
+    must outlive them.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -35,7 +35,7 @@ class Children:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # A second Ctrl-C must not leave lamps on: the children get their time.
+        # a second Ctrl-C must not leave lamps on
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             for _name, child in reversed(self._running):
@@ -44,20 +44,20 @@ class Children:
             signal.signal(signal.SIGINT, before)
 
     def start(
-        self, name: str, command: list[str], *, to_log: bool = True, answers: bool = False
+        self, name: str, command: list[str], *, to_log: bool = True, pipe: bool = False
     ) -> subprocess.Popen[str]:
-        """Start a child in its own process group, so that Ctrl-C reaches it through us, in order.
+        """Start a child in its own process group, which Ctrl-C does not reach.
 
-        With `answers` its stdout is a pipe, for `first_line`.
+        With `pipe` its stdout is a pipe, for `first_line`.
         """
         with contextlib.ExitStack() as stack:
-            # A Ctrl-C between its start and its entry would leave a child that nobody ends.
+            # a Ctrl-C between start and entry would leave a child that is never ended
             stack.enter_context(held(signal.SIGINT, signal.SIGTERM))
             log = stack.enter_context(self.log(name).open("a")) if to_log else None
             child = subprocess.Popen(
                 tied(command),
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE if answers else log,
+                stdout=subprocess.PIPE if pipe else log,
                 stderr=log,
                 text=True,
                 start_new_session=True,
@@ -75,27 +75,27 @@ class Children:
         readable, _, _ = select.select([child.stdout], [], [], seconds)
         line = child.stdout.readline() if readable else ""
         if not line:
-            if readable:  # the pipe was closed: the process is about to be gone
+            if readable:  # the pipe was closed: the process is about to end
                 child.wait(GRACE_S)
             raise self._not_ready(name, child, seconds)
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+        message: dict[str, Any] = json.loads(line)
+        return message
 
     def ready(self, name: str, command: list[str], seconds: float) -> dict[str, Any]:
         """Start a child; returns the JSON object that it prints when it is ready."""
-        return self.first_line(name, self.start(name, command, answers=True), seconds)
+        return self.first_line(name, self.start(name, command, pipe=True), seconds)
 
     def check(self) -> None:
         """Raise `CommandError` when a child has ended by itself."""
         for name, child in self._running:
             if child.poll() is not None:
                 raise CommandError(
-                    f"{name} ended with exit code {child.returncode}; {self._last_words(name)}",
+                    f"{name} ended with exit code {child.returncode}; {self._last_line(name)}",
                     UNREACHABLE,
                 )
 
     def peak_memory_gb(self) -> dict[str, float]:
-        """The most memory that each running child has held so far, GB; empty where unknown."""
+        """Peak memory of each running child, GB; empty where unknown."""
         peaks = {}
         for name, child in self._running:
             with contextlib.suppress(OSError):
@@ -109,9 +109,9 @@ class Children:
         code = child.poll()
         what = f"ended with exit code {code}" if code is not None else f"not ready in {seconds} s"
         why = BAD_INPUT if code in (2, 3) else UNREACHABLE
-        return CommandError(f"{name}: {what}; {self._last_words(name)}", why)
+        return CommandError(f"{name}: {what}; {self._last_line(name)}", why)
 
-    def _last_words(self, name: str) -> str:
+    def _last_line(self, name: str) -> str:
         log = self.log(name)
         if not log.is_file():
             return "see its output above"
@@ -120,7 +120,7 @@ class Children:
 
 
 def end(child: subprocess.Popen[str]) -> None:
-    """End a child: SIGTERM, and SIGKILL where that does not help."""
+    """End a child: SIGTERM, after `GRACE_S` SIGKILL."""
     if child.poll() is None:
         child.terminate()
         try:
@@ -139,7 +139,7 @@ def own_command(*arguments: str | Path) -> list[str]:
 
 @dataclass(frozen=True)
 class SimulatedRig:
-    """A rig file, and who sits in it: a subject's name, or a strand file with its head."""
+    """A rig file and its subject: a name, or a strand file with its head."""
 
     rig: Path
     subject: str = "wavy"

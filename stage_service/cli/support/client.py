@@ -1,4 +1,4 @@
-"""The service's HTTP API from the command line's side."""
+"""Client of the service's HTTP API."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from stage_service.records.tokens import own_file, own_token
 DEFAULT_URL = "http://127.0.0.1:8331"
 LEASE = "Hairstage-Lease"
 ATTEMPTS = 5
-"""How often a download is begun, or gone on with."""
+"""How often a download is begun or resumed."""
 LEASE_S = 120.0
-"""A command that dies blocks the stage for no longer."""
+"""Seconds of a lease; a command that dies blocks the stage for no longer."""
 
 
 class ServiceClient:
-    """A running service, for the length of a with-block. Its problems become `CommandError`s.
+    """A connection to a running service, a context manager. Problems are raised as `CommandError`.
 
     `lease` is the token of the lease under which it steers.
     """
@@ -63,26 +63,27 @@ class ServiceClient:
 
     def get(self, path: str) -> Any:
         """The JSON at `path`."""
-        return self.ask("GET", path)
+        return self.request("GET", path)
 
     def all(self, path: str, most: int = 1000) -> list[list[Any]]:
-        """The whole list at `path`, in pages of `most`, the first one that of the newest."""
+        """The list at `path` in pages of `most`, the newest page first."""
         pages: list[list[Any]] = []
         while not pages or len(pages[-1]) == most:
             pages.append(self.get(f"{path}?limit={most}&offset={most * len(pages)}"))
         return pages
 
     def post(self, path: str, body: Any = None) -> Any:
-        """Post `body` and return the answer's JSON."""
-        return self.ask("POST", path, json=body)
+        """Post `body`; returns the response's JSON."""
+        return self.request("POST", path, json=body)
 
-    def ask(self, method: str, path: str, **more: Any) -> Any:
-        """One request. Raises `CommandError`."""
+    def request(self, method: str, path: str, **more: Any) -> Any:
+        """Send one request; returns the response's JSON. Raises `CommandError`."""
         try:
             response = self._http.request(method, path, **more)
         except httpx.TransportError as error:
             raise CommandError(
-                f"no service answers at {self.url} ({error}): start one with 'hairstage serve', or "
+                f"no service responds at {self.url} ({error}): start one with 'hairstage serve', "
+                "or "
                 "name its URL with --url or HAIRSTAGE_URL",
                 UNREACHABLE,
                 "Unreachable",
@@ -92,9 +93,9 @@ class ServiceClient:
         raise _problem(response)
 
     def download(self, path: str, out: Path, progress: Progress) -> int:
-        """Write the bytes at `path` to the file `out`, whole or not at all; returns how many.
+        """Write the bytes at `path` to the file `out`, all or none; returns their number.
 
-        Goes on by ranges where the connection breaks. Raises `CommandError`.
+        Resumes by ranges after a broken connection. Raises `CommandError`.
         """
         etag = None
         with writing(out) as temporary, temporary.open("wb") as file:
@@ -103,16 +104,16 @@ class ServiceClient:
                     {"Range": f"bytes={file.tell()}-", "If-Range": etag} if etag else {}
                 )
                 try:
-                    with self._http.stream("GET", path, headers=more) as answer:
-                        if not answer.is_success:
-                            answer.read()
-                            raise _problem(answer)
-                        if answer.status_code != 206:  # not what was begun, or nothing was
+                    with self._http.stream("GET", path, headers=more) as response:
+                        if not response.is_success:
+                            response.read()
+                            raise _problem(response)
+                        if response.status_code != 206:  # the first attempt, or the file changed
                             file.seek(0)
                             file.truncate()
-                        etag = answer.headers["etag"]
-                        size = file.tell() + int(answer.headers["content-length"])
-                        for data in answer.iter_bytes():
+                        etag = response.headers["etag"]
+                        size = file.tell() + int(response.headers["content-length"])
+                        for data in response.iter_bytes():
                             file.write(data)
                             progress(f"{file.tell():,} of {size:,} bytes", file.tell() / size)
                         return file.tell()
@@ -122,9 +123,9 @@ class ServiceClient:
 
     @contextmanager
     def leased(self) -> Iterator[Callable[[], None]]:
-        """Steer alone until the end of the block; call what it yields at least every minute.
+        """Hold the lease until the end of the block; call the yielded function every minute.
 
-        Does nothing where this service already steers under a lease.
+        Does nothing if this client already has a lease.
         """
         if LEASE in self._http.headers:
             yield lambda: None
@@ -136,14 +137,14 @@ class ServiceClient:
         def renew() -> None:
             nonlocal renewed
             if time.monotonic() - renewed > LEASE_S / 4:
-                self.ask("PATCH", "/lease", json={"seconds": LEASE_S})
+                self.request("PATCH", "/lease", json={"seconds": LEASE_S})
                 renewed = time.monotonic()
 
         try:
             yield renew
         finally:
             with suppress(CommandError):  # it has expired, or the service has gone
-                self.ask("DELETE", "/lease")
+                self.request("DELETE", "/lease")
             self._steer_with(None)
 
     def _steer_with(self, token: str | None) -> None:
@@ -157,7 +158,9 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Poll a capture until it is done; `check` may raise to give up waiting."""
 
-        return self._follow(f"/captures/{capture}", lambda s: progress(*_capture_told(s)), check)
+        return self._follow(
+            f"/captures/{capture}", lambda s: progress(*_capture_progress(s)), check
+        )
 
     def follow_job(
         self, job: str, progress: Progress, check: Callable[[], None] = lambda: None
@@ -185,8 +188,8 @@ class ServiceClient:
             time.sleep(0.3)
 
 
-def _capture_told(status: dict[str, Any]) -> tuple[str, float]:
-    """What a capture is at, in words, and the share of its frames that have arrived."""
+def _capture_progress(status: dict[str, Any]) -> tuple[str, float]:
+    """State of a capture in words, and the share of its frames that have arrived."""
     running, planned = status["progress"], status["frames_planned"]
     if running is None:
         done, more = status["frames_written"], ""
@@ -211,21 +214,22 @@ def _problem(response: httpx.Response) -> CommandError:
 
 def _json(response: httpx.Response) -> Any:
     try:
-        answer = response.json()
-        if response.is_success or "title" in answer:
-            return answer
+        data = response.json()
+        if response.is_success or "title" in data:
+            return data
     except (ValueError, TypeError):
         pass
     raise CommandError(
-        f"{response.url} answers {response.status_code}, not as hairstage does: check --url and "
-        "HAIRSTAGE_URL",
+        f"{response.url} returned {response.status_code}, and no document of hairstage: check "
+        "--url "
+        "and HAIRSTAGE_URL",
         UNREACHABLE,
         "Unreachable",
     )
 
 
 def _own() -> str | None:
-    """This user's own token, which goes to services of this machine alone."""
+    """This user's token, which is sent to services of this machine alone."""
     try:
         return own_token() if own_file().exists() else None
     except OSError:
@@ -233,7 +237,7 @@ def _own() -> str | None:
 
 
 def me() -> str:
-    """This user and machine, as holder of a lease."""
+    """This user and machine, as the holder of a lease."""
     try:
         user = getpass.getuser()
     except (OSError, KeyError):  # a container's user may have no name

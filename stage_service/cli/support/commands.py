@@ -1,5 +1,5 @@
-"""What every command shares: `--json`, help, what it prints (results on stdout, progress on
-stderr), errors that become sentences and exit codes."""
+"""Shared by all commands: `--json`, help, output (results on stdout, progress on stderr), errors
+and exit codes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from reconstruction import Progress
 from reconstruction.reading import parse_json
-
-if TYPE_CHECKING:
-    from stage_service.cli.support.client import ServiceClient
 
 EXIT_CODES = {
     0: "done",
@@ -33,9 +30,9 @@ EXIT_CODES = {
 }
 FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
 PRIVATE = 0o027
-"""Frames are people's faces: what a stage writes is for its user, and to be read by its group."""
+"""umask of the stage's processes: frames show faces, so only user and group may read them."""
 LINE_EVERY_S = 10.0
-"""Where progress goes to a log, a line so often."""
+"""Seconds between progress lines in a log."""
 
 
 class Output:
@@ -52,17 +49,17 @@ class Output:
         from rich.console import Console
 
         shown = json.dumps(data, indent=1, allow_nan=False) if text is None else text
-        # A table in a file or a log has no window to fit.
+        # a table in a file or a log has no window to fit
         width = None if self._stdout.isatty() else 120
-        # names are printed as they are: ":x:" is part of one, and no picture
+        # names are printed as they are: ":x:" is no emoji
         console = Console(width=width, highlight=False, emoji=False, file=self._stdout)
         console.print(shown, markup=False, soft_wrap=True)
 
     def error(self, kind: str, detail: str, **more: Any) -> None:
-        """Say what went wrong: on stderr, and with --json as the one object on stdout too."""
+        """Print an error on stderr, and with --json as the one object on stdout."""
         if self.as_json:
-            said = {"error": {"type": kind, "detail": detail, **more}}
-            print(json.dumps(said), file=self._stdout, flush=True)
+            data = {"error": {"type": kind, "detail": detail, **more}}
+            print(json.dumps(data), file=self._stdout, flush=True)
         print(f"hairstage: {detail}", file=sys.stderr, flush=True)
 
     def note(self, text: str) -> None:
@@ -72,7 +69,7 @@ class Output:
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
-    """A `Progress` that draws a bar on stderr; no terminal there: now and then a line."""
+    """A `Progress` that draws a bar on stderr, or lines if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars
@@ -98,23 +95,22 @@ def progress_bar(title: str) -> Iterator[Progress]:
 
 
 def _lines(title: str) -> Progress:
-    told, at = float("-inf"), 0.0
+    printed, at = float("-inf"), 0.0
 
     def show(what: str, share: float) -> None:
-        nonlocal told, at
+        nonlocal printed, at
         now = time.monotonic()
-        if now - told >= LINE_EVERY_S or share >= 1 > at:
+        if now - printed >= LINE_EVERY_S or share >= 1 > at:
             per_cent = math.floor(100 * share)  # 100 is the end
             print(f"{title}: {per_cent:3d}% {what}", file=sys.stderr, flush=True)
-            told = now
+            printed = now
         at = share
 
     return show
 
 
-Commands = Any  # argparse does not export the type of what add_subparsers returns
+Commands = Any  # argparse does not export the return type of add_subparsers
 Run = Callable[[argparse.Namespace, Output], int | None]
-RemoteRun = Callable[[argparse.Namespace, Output, "ServiceClient"], int | None]
 
 
 class CommandError(Exception):
@@ -126,14 +122,14 @@ class CommandError(Exception):
 
 
 class BadArgument(CommandError):
-    """The user gave something that cannot be used."""
+    """An argument that cannot be used."""
 
     def __init__(self, message: str) -> None:
         super().__init__(message, BAD_INPUT, "BadInput")
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
-    """Tells of the defaults that say something."""
+    """Shows defaults, but for None, False and []."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         if action.default is None or action.default is False or action.default == []:
@@ -142,11 +138,11 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def add_command(
-    commands: Commands, name: str, run: Run | RemoteRun, help: str | None = None
+    commands: Commands, name: str, run: Callable[..., int | None], help: str | None = None
 ) -> argparse.ArgumentParser:
-    """Add a command with what every command has: `--json`, help, the function that runs it.
+    """Add a command with `--json`, its help, and `run`, the function that runs it.
 
-    The help is that function's docstring: its first sentence, and what follows as the description.
+    The help is the docstring of `run`: its first sentence, and the rest as the description.
     """
     first, _, rest = (inspect.getdoc(run) or "").partition("\n\n")
     help = help or _phrase(first)
@@ -158,26 +154,8 @@ def add_command(
     return parser
 
 
-def add_remote(
-    commands: Commands, name: str, run: RemoteRun, help: str | None = None
-) -> argparse.ArgumentParser:
-    """Add a command that asks a running service."""
-
-    def connected(args: argparse.Namespace, output: Output) -> int | None:
-        from stage_service.cli.support.client import ServiceClient
-
-        with ServiceClient(args.url, args.lease) as service:
-            return run(args, output, service)
-
-    parser = add_command(commands, name, run, help)
-    parser.set_defaults(run=connected)
-    parser.add_argument("--url", help="the service's URL (also: HAIRSTAGE_URL)")
-    parser.add_argument("--lease", help="token of the lease under which to steer")
-    return parser
-
-
 def add_group(commands: Commands, name: str, help: str) -> Commands:
-    """Add a command that has commands of its own."""
+    """Add a command with subcommands."""
     parser = commands.add_parser(name, help=help, description=_sentence(help))
     return parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
@@ -192,32 +170,32 @@ def _phrase(sentence: str) -> str:
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
-    """Add what of a capture is seen: `--hold-out-camera`, `--hold-out-light`, `--reduce`."""
+    """Add the view of a capture: `--hold-out-camera`, `--hold-out-light`, `--reduce`."""
     for kind in ("camera", "light"):
         parser.add_argument(
             f"--hold-out-{kind}",
             action="append",
             default=[],
             metavar=kind.upper(),
-            help=f"a {kind} to leave out, to judge the result on (repeat for more)",
+            help=f"a {kind} to hold out and score the result on (repeat for more)",
         )
     parser.add_argument(
         "--reduce",
         type=int,
         default=1,
         metavar="N",
-        help="work on means over N × N pixels: large pictures need a fraction of time and memory",
+        help="work on means over N × N pixels, which takes a fraction of time and memory",
     )
 
 
 def rig_path(text: str) -> Path:
-    """The path of a rig file, or of one that comes with hairstage where its name is given."""
+    """The path of a rig file, given as a path or as the name of one that comes with hairstage."""
     own = Path(__file__).parents[2] / "rigs" / f"{text}.toml"
     return own if own.is_file() else Path(text)
 
 
 def whole(least: int, most: int = 1_000_000) -> Callable[[str], int]:
-    """What reads an option's whole number from `least` to `most`."""
+    """A parser of an option's integer from `least` to `most`."""
 
     def number(text: str) -> int:
         if not least <= (value := int(text)) <= most:
@@ -228,7 +206,7 @@ def whole(least: int, most: int = 1_000_000) -> Callable[[str], int]:
 
 
 def read_json(text: str | Path | None) -> dict[str, Any]:
-    """The JSON object of an option: the text itself, or the file that it names; {} for None."""
+    """The JSON object of an option, inline or in the file that it names; {} for None."""
     if text is None:
         return {}
     inline = str(text).lstrip().startswith("{")
@@ -242,7 +220,7 @@ def read_json(text: str | Path | None) -> dict[str, Any]:
 
 
 def in_url(name: str) -> str:
-    """A name as one part of a URL's path, in which `#`, `?`, `%` and `/` say something else."""
+    """A name as one segment of a URL's path, escaped."""
     return quote(name, safe="")
 
 
@@ -251,13 +229,13 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
     args = parser.parse_args(argv)
     output = Output(as_json=args.json)
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # OpenEXR's warnings do not belong to a result
+        with contextlib.redirect_stdout(sys.stderr):  # OpenEXR prints warnings
             return args.run(args, output) or 0
     except KeyboardInterrupt:
         output.error("Interrupted", "interrupted")
         return 130
     except BrokenPipeError:
-        # whoever read the output has seen enough; keep the interpreter's last flush quiet, too
+        # the reader has closed the pipe; the interpreter flushes once more at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except CommandError as error:
@@ -267,21 +245,21 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
         if isinstance(error, OSError | ValueError | LookupError) and _is_ours(error):
             output.error(type(error).__name__, _message(error))
             return BAD_INPUT
-        if type(error).__name__ != "BackendError":  # its module may be what cannot be imported
+        if type(error).__name__ != "BackendError":  # by name: its module may fail to import
             traceback.print_exc(file=sys.stderr)
         output.error(type(error).__name__, str(error))
         return FAILED
 
 
 def _is_ours(error: Exception) -> bool:
-    """Whether a reader or a check of ours raised it about the user's input, not a library."""
+    """Whether our code raised it about the user's input, and not a library."""
     ours = {"reconstruction", "appearance", "stage_service", "benchmarks"}
     ours |= {"builtins", "pydantic_core"}
     return isinstance(error, OSError) or type(error).__module__.split(".")[0] in ours
 
 
 def _message(error: Exception) -> str:
-    """The error's sentence; a `KeyError` quotes it, pydantic makes paragraphs of it."""
+    """The error's sentence, without the quotes of `KeyError` and the paragraphs of pydantic."""
     from pydantic import ValidationError
 
     from reconstruction.options import sentence

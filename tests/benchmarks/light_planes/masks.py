@@ -23,6 +23,7 @@ from appearance import HairAppearance, build_scene
 from appearance.render.coverage import coverage
 from benchmarks.captures import SimulatedCapture
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, data_folder, option, within
+from benchmarks.demo import markdown_table
 from benchmarks.light_planes.subjects import FRAMINGS, subject_capture
 from benchmarks.light_planes.without_help import copied
 from benchmarks.results import save
@@ -40,7 +41,6 @@ from reconstruction.masks import (
 )
 from stage_service.cli.demo import hold_out
 from stage_service.cli.support.commands import rig_path, whole
-from stage_service.cli.support.tables import markdown_table
 from stage_service.jobs.records import JobOptions
 from stage_service.jobs.steps import STEPS, StepContext
 from stage_service.model_page.names import THRESHOLDS, threshold
@@ -253,7 +253,7 @@ def report(results: Mapping[str, Mapping[str, Any]], seed: int) -> str:
                 )
             for kind, job in judged["jobs"].items():
                 jobs[f"{name}, {paths} paths, {kind} masks"] = [{**job, "seed": seed}]
-    return "\n".join([*text, "", markdown_table(jobs, short=True), ""])
+    return "\n".join([*text, "", markdown_table(jobs), ""])
 
 
 BENCHMARK = Benchmark(run, (CACHE, ONLY, PATHS, LIGHTS, DRAWS))

@@ -56,7 +56,7 @@ class Live:
         whole = (
             [*command, *self.words(self.root)] if command else own_command(*self.words(self.root))
         )
-        self.child: subprocess.Popen[str] = self._children.start(name, whole, answers=True)
+        self.child: subprocess.Popen[str] = self._children.start(name, whole, pipe=True)
         url = self._children.first_line(name, self.child, HURRY_S)["url"]
         # A connection each: one that waits for its next request makes room where there are many.
         each = httpx.Limits(max_keepalive_connections=0)

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -26,7 +25,6 @@ from reconstruction import (
     Rig,
     Step,
     Strands,
-    write_exr,
     write_strands,
 )
 from simulators.subject.grooms import GROOMS
@@ -67,7 +65,7 @@ def test_every_command_says_what_it_does_and_speaks_json():
     names = {" ".join(name.split()[1:]) for name in commands}
     assert {"demo", "serve", "worker", "simulate", "verify", "import"} <= names
     assert {"reconstruct", "fit", "render", "bench"} <= names
-    assert {"evaluate geometry", "evaluate images", "rig check"} <= names
+    assert {"evaluate geometry", "rig check"} <= names
     assert {"capture start", "capture abort", "jobs submit", "jobs cancel"} <= names
     for name, parser in commands.items():
         assert parser.get_default("json") is False, name
@@ -363,7 +361,6 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
         ("rig check demo --radius nan", "radius > 0"),
         ("head mark {tmp}/bytes --out {tmp}/h.obj", "bytes is no Wavefront OBJ"),
         ("head fit {tmp}/bytes --out {tmp}/h.obj --turn-deg inf", "--turn-deg inf: expected"),
-        ("evaluate images {tmp} {tmp}/absent", "absent: no such picture or folder"),
         ("export m --to usd --out {tmp}/a.usdc --cards 9", "--cards is for --to gltf, not usd"),
         ("export m --to hair --out {tmp}/a.hair --guides 9", "--guides is for --to usd or houdini"),
         ("export m --to maps --out {tmp}/a --environment sky", "--environment is for --to mitsuba"),
@@ -453,158 +450,6 @@ def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_pat
         assert code == 3
         assert said in data["error"]["detail"]
         assert "\n" not in data["error"]["detail"]
-
-
-def test_evaluate_images_compares_files_and_folders(capsys, tmp_path):
-    image = np.random.default_rng(0).uniform(0, 200, (16, 16, 3))
-    for folder, offset in (("pred", 10.0), ("true", 0.0)):
-        (tmp_path / folder).mkdir()
-        cv2.imwrite(str(tmp_path / folder / "a.png"), (image + offset).astype(np.uint8))
-        write_exr(tmp_path / folder / "b.exr", image.astype(np.float32))
-    code, data = run(capsys, "evaluate", "images", tmp_path / "pred", tmp_path / "true")
-    assert code == 0
-    assert data["images"]["a.png"]["psnr"] == pytest.approx(20 * np.log10(25.5), abs=0.01)
-    assert data["images"]["b.exr"] == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
-    cv2.imwrite(str(tmp_path / "true" / "only.png"), image.astype(np.uint8))
-    assert main(["evaluate", "images", str(tmp_path / "pred"), str(tmp_path / "true")]) == 0
-    assert "1 pictures are in one of the folders alone" in capsys.readouterr().err
-    code, data = run(
-        capsys, "evaluate", "images", tmp_path / "pred" / "a.png", tmp_path / "true" / "b.exr"
-    )
-    assert code == 3
-    assert "two EXR files" in data["error"]["detail"]
-
-
-def test_evaluate_images_names_the_picture_that_cannot_be_compared(capsys, tmp_path):
-    image = np.random.default_rng(0).uniform(0.1, 1, (16, 16, 3)).astype(np.float32)
-    broken = {"nan": image * np.where(np.arange(16) == 3, np.nan, 1)[:, None, None]}
-    broken |= {"inf": np.where(image > 0.9, np.inf, image), "black": 0 * image, "true": image}
-    for name, values in broken.items():
-        write_exr(tmp_path / f"{name}.exr", values.astype(np.float32))
-    cv2.imwrite(str(tmp_path / "float.hdr"), image)
-    cv2.imwrite(str(tmp_path / "true.png"), (255 * image).astype(np.uint8))
-    cv2.imwrite(str(tmp_path / "none.png"), np.zeros((16, 16), np.uint8))
-    cv2.imwrite(str(tmp_path / "half.png"), np.full((8, 16), 255, np.uint8))
-    for pred, true, mask, said in [
-        ("nan.exr", "true.exr", None, "nan.exr: 48 of its values are not finite"),
-        ("inf.exr", "true.exr", None, "inf.exr: "),
-        ("true.exr", "nan.exr", None, "nan.exr: 48 of its values"),
-        ("true.exr", "black.exr", None, "black.exr: under one pixel in a hundred is lit"),
-        ("float.hdr", "true.png", None, "float.hdr: linear pictures are compared as .exr"),
-        ("true.exr", "true.exr", "none.png", "none.png: a mask must mark pixels"),
-        ("true.exr", "true.exr", "half.png", "half.png: a mask must mark pixels"),
-    ]:
-        words: list[Any] = ["evaluate", "images", tmp_path / pred, tmp_path / true]
-        words += [] if mask is None else ["--mask", tmp_path / mask]
-        code, data = run(capsys, *words)
-        assert code == 3
-        assert said in data["error"]["detail"]
-
-
-def test_evaluate_table_sets_demos_beside_each_other(capsys, tmp_path):
-    def strands(f: float) -> dict[str, Any]:
-        return {over: {"1mm_10deg": {"f": f}} for over in ("visible", "all")}
-
-    pictures = {name: {"psnr": 20.0, "ssim": 0.5} for name in ("ours", "diffuse", "three_nearest")}
-    results = {
-        "subject": "curly",
-        "seed": 3,
-        "geometry": {
-            **strands(0.253),
-            "equal_length": strands(0.204),
-            "lengths": {
-                "pred": {"strands": 107000, "total_m": 4581.2},
-                "true": {"strands": 10500, "total_m": 1771.0},
-            },
-            "connectivity": {"pred": {"on_one": {"mean": 0.171}}},
-        },
-        "baselines": {"hull_vertical": strands(0.022), "hull_smooth_field": strands(0.032)},
-        "images": {
-            "held_out_lights": pictures,
-            "held_out_camera": {
-                **pictures,
-                "three_nearest_own_frames": {"psnr": 21.44, "ssim": 0.706},
-            },
-        },
-        "appearance": {"fitted": {"beta_m": 0.887}, "true": {"beta_m": 0.28}},
-        "warnings": ["fit: the roughness is at its bound"],
-    }
-    file = tmp_path / "results.json"
-    file.write_text(json.dumps(results))
-    assert main(["evaluate", "table", str(file)]) == 0
-    head, _, *rest = capsys.readouterr().out.splitlines()
-    assert head == "|  | curly, seed 3 [1] |"
-    assert "| F at 1 mm/10°, visible points: ours | 25.3 % |" in rest
-    assert "| F at 1 mm/10°, visible points, at equal length: ours | 20.4 % |" in rest
-    assert {"| strands: ours | 107,000 |", "| strands: the truth | 10,500 |"} <= set(rest)
-    assert {"| metres: ours | 4,581 m |", "| metres: the truth | 1,771 m |"} <= set(rest)
-    assert "| most of a strand on one true strand: ours | 0.17 |" in rest
-    own = "held-out camera: three nearest lights in that camera's own frames"
-    assert f"| {own} | 21.4 dB / 0.71 |" in rest
-    rows = {
-        "| β_M to render these strands with | 0.89 |",
-        "| β_M of the fibres: the truth | 0.28 |",
-    }
-    assert rows <= set(rest)
-    assert rest[-1] == "[1] fit: the roughness is at its bound"
-    assert main(["evaluate", "table", "--short", str(file)]) == 0
-    brief = capsys.readouterr().out.splitlines()
-    left_out = {title for title, *_ in (line[2:].split(" |") for line in {*rest} - {*brief})}
-    assert left_out == {own, "F at 1 mm/10°, visible points: hull + vertical"} | {
-        "F at 1 mm/10°, all points: hull + vertical",
-        "] fit: the roughness is at its bound",
-    }, "what is ours stays, and what it is held against"
-    assert brief[-1] == "[1] 1 warning of these runs"
-    again = tmp_path / "again.json"
-    found = {"beta_m": 0.3, "beta_m_error": 0.1, "sigma_a": [0.11, 0.15, 0.5]}
-    results["appearance"]["fitted"] |= found
-    results["appearance"]["true"]["sigma_a"] = [0.1, 0.2, 0.45]
-    again.write_text(json.dumps(results))
-    assert main(["evaluate", "table", str(again)]) == 0
-    rows = {"| β_M of Sun's fit: standard error | 0.03 |"}
-    rows |= {"| σ_a, the channel that is furthest off | 25 % |"}
-    assert rows <= set(capsys.readouterr().out.splitlines())
-    code, data = run(capsys, "evaluate", "table", file, again)
-    assert (code, list(data["results"])) == (0, [f"curly, seed 3 ({f})" for f in (file, again)])
-
-    other = {**results, "seed": 4, "warnings": ["fit: the roughness is at its bound"]}
-    other["appearance"] = {"fitted": {"beta_m": 0.287}, "true": {"beta_m": 0.28}}
-    again.write_text(json.dumps(other))
-    assert main(["evaluate", "table", str(file), str(again)]) == 0
-    head, _, *rest = capsys.readouterr().out.splitlines()
-    assert head == "|  | curly, seeds 3, 4 [1] |"
-    assert "| β_M to render these strands with | 0.59 ± 0.42 |" in rest
-    assert f"| {own} | 21.4 ± 0.0 dB / 0.71 ± 0.00 |" in rest
-    assert rest[-1] == "[1] fit: the roughness is at its bound (seed 3, 4)"
-    code, data = run(capsys, "evaluate", "table", file, again)
-    (spread,) = data["figures"]["curly, seeds 3, 4"]["β_M to render these strands with"]
-    assert spread == pytest.approx({"mean": 0.587, "std": 0.3 * 2**0.5, "n": 2})
-    of_files = {"| F at 1 mm/10°, visible points: ours | 25.3 % | 25.3 % |"}
-    for names, heads in (
-        (("a/lee.npz", "b/kim.tfx"), ("lee", "kim")),
-        (("a/hair.npz", "b/hair.tfx"), ("a/hair.npz", "b/hair.tfx")),
-    ):
-        for path, subject in zip((file, again), names, strict=True):
-            path.write_text(json.dumps({**results, "subject": subject}))
-        assert main(["evaluate", "table", str(file), str(again)]) == 0
-        head, _, *rest = capsys.readouterr().out.splitlines()
-        assert head == f"|  | {heads[0]}, seed 3 [1] | {heads[1]}, seed 3 [2] |"
-        assert of_files <= set(rest)
-    damaged = {**results, "geometry": {}}
-    del results["subject"]
-    for text, said in (
-        (json.dumps(results), "has no subject"),
-        (json.dumps(damaged), "has no 'visible'"),
-        (json.dumps({**damaged, "geometry": 3}), "a figure of another kind"),
-        ("[]", "not a JSON object"),
-        ("{", "not JSON"),
-        (json.dumps({**damaged, "seed": float("nan")}), "NaN is not a number"),
-    ):
-        file.write_text(text)
-        code, data = run(capsys, "evaluate", "table", file)
-        assert code == 3
-        assert str(file) in data["error"]["detail"]
-        assert said in data["error"]["detail"]
 
 
 def test_lamps_are_put_off_where_the_service_cannot_have_its_root(
@@ -698,11 +543,11 @@ def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path)
 
     def command() -> None:
         with Children(tmp_path) as children:
-            child = children.start("good", sleeper, answers=True)
+            child = children.start("good", sleeper, pipe=True)
             pids.append(child.pid)
             assert children.first_line("good", child, 10) == {}
             assert children.peak_memory_gb()["good"] > 0.001
-            children.first_line("bad", children.start("bad", failing, answers=True), 10)
+            children.first_line("bad", children.start("bad", failing, pipe=True), 10)
 
     with pytest.raises(CommandError, match=r"bad: ended with exit code 1; .*no such camera"):
         command()

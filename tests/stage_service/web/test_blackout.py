@@ -237,60 +237,53 @@ ANSWERED = {
 }
 
 
-@pytest.mark.parametrize("state", ANSWERED)
-def test_blackout_where_the_service_answers(state, desk, film):
-    for press in (f9, button):
-        page = ANSWERED[state](desk)
-        if press is f9:
-            film.take(page, f"{state}_before", sizes=SHOWN, brightest=2 * BRIGHTEST)
-        press(page)
-        page.wait_for_selector(
-            "#notices:has-text('Dark, verified'), .alarm:has-text('Dark, verified')"
-        )
-        (last,) = desk.http.get("/captures?limit=1").json()
-        assert desk.outcome(last["id"]) == "aborted"
-        assert not desk.lit
-        page.wait_for_selector("#top .state:text-is('dark'), #top .state:text-is('not logged in')")
-        if press is f9:
-            film.take(page, f"{state}_after", sizes=SHOWN, brightest=2 * BRIGHTEST)
-        desk.settle()
+@pytest.mark.parametrize(
+    ("press", "state"),
+    [((f9, button)[k % 2], state) for k, state in enumerate(ANSWERED)],
+)
+def test_blackout_where_the_service_answers(press, state, desk, film):
+    page = ANSWERED[state](desk)
+    film.take(page, f"{state}_before", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    press(page)
+    page.wait_for_selector("#notices:has-text('Dark, verified'), .alarm:has-text('Dark, verified')")
+    (last,) = desk.http.get("/captures?limit=1").json()
+    assert desk.outcome(last["id"]) == "aborted"
+    assert not desk.lit
+    page.wait_for_selector("#top .state:text-is('dark'), #top .state:text-is('not logged in')")
+    film.take(page, f"{state}_after", sizes=SHOWN, brightest=2 * BRIGHTEST)
     assert film.wrong == [], "\n".join(film.wrong)
 
 
 def test_a_page_that_was_never_logged_in_shows_that_it_cannot_darken(desk, film):
-    for press in (f9, button):
-        page = desk.pages().open()
-        page.wait_for_selector(".alarm:has-text('This page cannot darken the stage.')")
-        capture = desk.light()
-        press(page)
-        page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})")
-        assert desk.http.get(f"/captures/{capture}").json()["state"] == "running"
-        if press is f9:
-            film.take(page, "never_logged_in", sizes=SHOWN, brightest=2 * BRIGHTEST)
-        page.fill("[name=token]", own_token())
-        page.keyboard.press("Enter")
-        assert desk.outcome(capture) == "aborted"
-        page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})", state="detached")
-        assert not desk.lit
-        desk.settle()
+    page = desk.pages().open()
+    page.wait_for_selector(".alarm:has-text('This page cannot darken the stage.')")
+    capture = desk.light()
+    button(page)
+    page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})")
+    assert desk.http.get(f"/captures/{capture}").json()["state"] == "running"
+    film.take(page, "never_logged_in", sizes=SHOWN, brightest=2 * BRIGHTEST)
+    page.fill("[name=token]", own_token())
+    page.keyboard.press("Enter")
+    assert desk.outcome(capture) == "aborted"
+    page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})", state="detached")
+    assert not desk.lit
     assert film.wrong == [], "\n".join(film.wrong)
 
 
-def test_a_lamp_that_stays_lit_is_named_whenever_blackout_is_pressed(stage, film):
+def test_a_lamp_that_stays_lit_is_named_when_blackout_is_pressed(stage, film):
     desk = stage(Fault("lights", "stuck", 5))
     page = desk.page()
     desk.light()
     says(page, "UNSAFE")
     (lamp,) = desk.world.lamps.power().nonzero()[0]
-    for press in (f9, button):
-        press(page)
-        page.wait_for_selector(".notice:has-text('unknown, unsafe')")
-        assert desk.lit
-        assert f"light_{lamp:03d} was lit last" in page.text_content(".alarm.latch")
-        assert page.text_content("circle.doubt title") == f"light_{lamp:03d}"
-        assert "verified" not in page.text_content("body")
-        for offered in ("Shoot what is missing", "New capture"):
-            assert not page.is_visible(f"text={offered}")
+    button(page)
+    page.wait_for_selector(".notice:has-text('unknown, unsafe')")
+    assert desk.lit
+    assert f"light_{lamp:03d} was lit last" in page.text_content(".alarm.latch")
+    assert page.text_content("circle.doubt title") == f"light_{lamp:03d}"
+    assert "verified" not in page.text_content("body")
+    for offered in ("Shoot what is missing", "New capture"):
+        assert not page.is_visible(f"text={offered}")
     film.take(page, "unsafe", sizes=SHOWN, brightest=2 * BRIGHTEST)
     assert film.wrong == [], "\n".join(film.wrong)
 
@@ -307,9 +300,9 @@ def no_answer(page: Any, desk: Desk) -> None:
     assert "left" not in page.text_content("#top .detail")
 
 
-def frozen_or_dead(desk: Desk) -> dict[Callable[[Any], None], Any]:
+def frozen_or_dead(desk: Desk, *presses: Callable[[Any], None]) -> dict[Callable[[Any], None], Any]:
     """A page for each way to press, that shows a lit lamp."""
-    pages = {press: desk.page() for press in (f9, button)}
+    pages = {press: desk.page() for press in presses}
     desk.light()
     for page in pages.values():
         page.wait_for_selector("circle.light.lit")
@@ -327,9 +320,9 @@ def press_unanswered(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> Non
         assert "Press the wired emergency stop" in alarm.text_content()
 
 
-@pytest.mark.parametrize("login", ["kept", "ended"])
+@pytest.mark.parametrize("login", ["kept", pytest.param("ended", marks=pytest.mark.slow)])
 def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
-    pages = frozen_or_dead(desk)
+    pages = frozen_or_dead(desk, f9, button)
     desk.kill()
     press_unanswered(desk, pages)
     if login == "kept":
@@ -357,7 +350,7 @@ def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
 
 
 def test_blackout_over_a_frozen_service_is_shown_as_not_answered(desk, film):
-    pages = frozen_or_dead(desk)
+    pages = frozen_or_dead(desk, f9)
     desk.process.send_signal(signal.SIGSTOP)
     press_unanswered(desk, pages)
     film.take(pages[f9], "frozen", sizes=SHOWN, brightest=2 * BRIGHTEST)
