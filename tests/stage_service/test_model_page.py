@@ -180,7 +180,7 @@ def test_a_page_of_little_is_a_page(tmp_path, capsys):
     empty = Model(tmp_path / "empty").create()
     assert "There are no strands yet" in Page(model_page(empty)).text
     assert main(["page", str(empty.path), "--json"]) == 3
-    assert "no model" in capsys.readouterr().out
+    assert "not a model" in capsys.readouterr().out
     empty.write_strands(Strands.from_list([]))
     assert main(["page", str(empty.path)]) == 0
     text = Page((empty.path / "index.html").read_text()).text
