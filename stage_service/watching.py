@@ -61,7 +61,7 @@ class Watching:
         has said that a worker runs."""
         seen = self._disk.get()
         worker = any(w.alive for w in seen["workers"])
-        if seen["free"] is None or self._disk.looking_s() > SILENT_S:
+        if seen["free"] is None or self._disk.running_s() > SILENT_S:
             return None, worker
         return int(seen["free"]), worker
 
@@ -72,7 +72,7 @@ class Watching:
         free = disk["free"]
         if disk["gone"]:
             found.append(disk["gone"])
-        elif free is None or self._disk.looking_s() > SILENT_S:
+        elif free is None or self._disk.running_s() > SILENT_S:
             found.append(f"{self.root}: the disk does not answer")
         elif free < RESERVE:
             left = f"{free / 1e6:.0f} MB free; {RESERVE / 1e6:.0f} MB are kept"

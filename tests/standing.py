@@ -11,7 +11,7 @@ from typing import Any
 
 PLACES = [
     ("connecting", "after stage_service.devices.device_set:DeviceSet.connect", 1, "software"),
-    ("arming", "after stage_service.acquisition.sequencer:Sequencer._arm", 1, "software"),
+    ("arming", "after stage_service.acquisition.frame_intake:FrameIntake.arm", 1, "software"),
     ("a lamp lit", "after stage_service.acquisition.exposing:Exposing._light", 6, "software"),
     ("all lamps lit", "after stage_service.acquisition.exposing:Exposing._light", 2, "software"),
     (
@@ -21,7 +21,7 @@ PLACES = [
         "software",
     ),
     ("after a pulse", "stage_service.acquisition.exposing:Exposing._check_lamps", 5, "software"),
-    ("reading frames", "stage_service.acquisition.sequencer:Sequencer._account", 9, "software"),
+    ("reading frames", "stage_service.acquisition.frame_intake:FrameIntake.account", 9, "software"),
     ("storing a frame", "reconstruction.files.durable:_write", 9, "software"),
     ("after storing frames", "reconstruction.capture.writer:CaptureWriter.commit", 4, "software"),
     (

@@ -1,9 +1,9 @@
 """Every pulse against every frame: which frame belongs to which step, and which never came.
 
 A camera numbers its frames; the trigger box counts its pulses. Between two frames of a camera that
-we read there were `m` pulses of which it answered none, so its number may advance by 1 (it missed
-the pulses) up to 1 + m (frames were made and lost on the way). Anything else means that frames and
-pulses are out of step, and that frames could stand for the wrong light.
+the service read lie `m` pulses without a frame, so its number may advance by 1 (the camera missed
+the pulses) up to 1 + m (frames were made and lost on the way). Any other number means that frames
+and pulses are out of step, and that frames may be assigned to the wrong light.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from itertools import pairwise
 from stage_service.devices.errors import IndexShift
 
 CLOCK_DRIFT = 2e-4
-"""By which share a camera's clock may be faster or slower than the host's."""
+"""Largest relative difference between the rates of a camera's clock and the host's."""
 
 
 class PulseAccount:
@@ -25,21 +25,23 @@ class PulseAccount:
         self.count = count
 
     def fired(self, count: int) -> None:
-        """Take the box's answer to a pulse. Raises `IndexShift` for doubled or lost pulses."""
+        """Check the box's count after one pulse. Raises `IndexShift` for doubled or lost pulses."""
         self.ran(1, count)
 
     def ran(self, pulses: int, count: int) -> None:
-        """Take the box's count after that many pulses. Raises `IndexShift`."""
+        """Check the box's count after `pulses` pulses. Raises `IndexShift`."""
         expected = self.count + pulses
         if count != expected:
             received = f"pulse {count}"
-            todo = "Somebody else fires the cameras, or the box restarted: start again."
+            todo = (
+                "Something else fires the cameras, or the box restarted: start the capture again."
+            )
             raise IndexShift(self.device, "counting pulses", f"pulse {expected}", received, todo)
         self.count = count
 
 
 class FrameAccount:
-    """One camera's block ids against the pulses that it should have answered."""
+    """One camera's block ids against the pulses that should have made frames."""
 
     def __init__(self, device: str, wrap: int) -> None:
         self.device = device
@@ -50,7 +52,7 @@ class FrameAccount:
         self._timed_at = 0.0
 
     def armed(self) -> None:
-        """The exposure may have changed, and with it what a time stamp means."""
+        """Forget the clock offset: a time stamp depends on the exposure."""
         self._ahead = None
 
     def missed(self) -> None:
@@ -60,7 +62,7 @@ class FrameAccount:
     def arrived(self, block_id: int, left: int = 0) -> None:
         """The frame of the newest pulse, with `left` frames behind it.
 
-        Raises `IndexShift` when its number does not fit, or when there are frames behind it: then
+        Raises `IndexShift` when its number does not fit, and when frames are behind it: then
         something else fired the camera.
         """
         self._advance(block_id, 1 + self.unanswered)
@@ -71,9 +73,9 @@ class FrameAccount:
     def timed(self, timestamp: float, requested: float, replied: float) -> None:
         """Check that the frame was made by the newest pulse, which fired between the two times.
 
-        How far the host's clock is ahead of the camera's is bounded by each frame; a frame of an
-        earlier pulse contradicts the others, because each pulse is asked for after the last was
-        answered. Raises `IndexShift`.
+        Each frame bounds how far the host's clock is ahead of the camera's. A frame of an earlier
+        pulse contradicts these bounds, because each pulse is requested after the box has replied
+        to the one before. Raises `IndexShift`.
         """
         low, high = requested - timestamp, replied - timestamp
         if self._ahead is not None:
@@ -94,44 +96,34 @@ class FrameAccount:
         self._advance(block_id, self.unanswered)
         self.unanswered -= 1
 
-    def place(
-        self,
-        block_ids: Sequence[int],
-        timestamps: Sequence[float],
-        schedule: Sequence[float],
-        steady: bool = True,
-    ) -> list[int] | None:
+    def place(self, block_ids: Sequence[int], pulses: int) -> list[int] | None:
         """The pulse that each frame of a hardware-stepped run belongs to, from 0.
 
-        `schedule` has the pulses' times in seconds. Gaps in the block ids are frames that were
-        lost on the way. A trigger that came while the camera was busy leaves no gap: then only the
-        timestamps can tell which, of a run that kept its schedule (`steady`). None where they
-        cannot, or are missing: no frame of the run may be used. Raises `IndexShift` for more frames
-        than pulses, and for ids that repeat.
+        Gaps in the block ids are frames that were lost on the way. A trigger that came while the
+        camera was busy leaves no gap; then the ids cannot show which pulse it was, and the result
+        is None: no frame of the run may be used. Raises `IndexShift` for more frames than pulses,
+        and for ids that repeat.
         """
-        pulses = len(schedule)
         if not block_ids:
             self.unanswered += pulses
             return []
         skipped = self._advance(block_ids[0], pulses + self.unanswered) - 1
         after = [(b - block_ids[0]) % self.wrap for b in block_ids]
         rising = all(a < b for a, b in pairwise(after))
-        known = all(1 <= b <= self.wrap for b in block_ids)
-        if not known or not rising or after[-1] >= pulses:
+        in_range = all(1 <= b <= self.wrap for b in block_ids)
+        if not in_range or not rising or after[-1] >= pulses:
             todo = "Something else fired the camera, or it repeats frames."
             raise self._shift(f"at most {pulses} frames with rising numbers", block_ids[-1], todo)
         # Ids that were skipped may have belonged to pulses before this run.
         start = max(0, skipped - self.unanswered)
-        whole = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
-        places: list[int] | None = [start + k for k in after]
-        if not whole:
-            places = _by_time(start, after, timestamps, schedule) if steady else None
+        complete = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
+        places = [start + k for k in after] if complete else None
         self.last = block_ids[-1]
-        self.unanswered = pulses - 1 - (places[-1] if places else after[-1])
+        self.unanswered = 0 if complete else pulses - 1 - after[-1]
         return places
 
     def _advance(self, block_id: int, most: int) -> int:
-        """How many ids this one is after the last frame's, 1 to `most`; it is the last one now."""
+        """Ids from the last frame's to this one, 1 to `most`; stores this one as the last."""
         before = self.last or 0
         advance = (block_id - before) % self.wrap
         if not 1 <= block_id <= self.wrap or not 1 <= advance <= most:
@@ -143,7 +135,7 @@ class FrameAccount:
 
     def _stray(self, received: str) -> IndexShift:
         expected = "no frame beside those of our pulses"
-        todo = "Something else fired the camera: frames since the last check may stand for other "
+        todo = "Something else fired the camera: frames since the last check may show other "
         todo += "steps. Check the trigger cable and start again."
         return IndexShift(self.device, "matching frames to pulses", expected, received, todo)
 
@@ -151,28 +143,3 @@ class FrameAccount:
         todo = f"{why} Check the trigger cable for doubled pulses and start again."
         received = f"block id {block_id}"
         return IndexShift(self.device, "matching frames to pulses", expected, received, todo)
-
-
-def _by_time(
-    start: int, after: Sequence[int], timestamps: Sequence[float], schedule: Sequence[float]
-) -> list[int] | None:
-    """Places that fit block ids and, to half a step, the time from one frame to the next; None
-    unless exactly one does. From one to the next: a box that is a little slower than its schedule
-    is late by whole steps at the end of a long run."""
-    if len(after) < 2 or any(a >= b for a, b in pairwise(timestamps)):
-        return None
-    slack = 0.5 * min(b - a for a, b in pairwise(schedule))
-    fits = []
-    for first in range(start, len(schedule) - after[-1]):
-        found = [first]
-        steps = zip(pairwise(timestamps), pairwise(after), strict=True)
-        for (stamp, later), (number, next_number) in steps:
-            due = schedule[found[-1]] + later - stamp
-            nearest = min(range(len(schedule)), key=lambda i: abs(schedule[i] - due))
-            at_least = found[-1] + next_number - number
-            if abs(schedule[nearest] - due) > slack or nearest < at_least:
-                break
-            found.append(nearest)
-        else:
-            fits.append(found)
-    return fits[0] if len(fits) == 1 else None

@@ -27,9 +27,9 @@ class Pulse:
 class Exposing:
     """Exposes a step on connected devices, at most `rate_hz` times a second.
 
-    `watch` is called right before a step's light, and raises what forbids it. Raises `DeviceError`
-    where a device fails, `NotPermitted` where the thread's permission is over, `Cancelled` when
-    `cancel` is set meanwhile.
+    `watch` is called right before a step's light and raises what forbids it. Raises `DeviceError`
+    where a device fails, `NotPermitted` without a live permission, `Cancelled` once `cancel` is
+    set.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Exposing:
             requested = time.monotonic()
             count = self._devices.trigger.pulse(step.exposure)
             pulse = Pulse(count, requested, time.monotonic())
-        # From the box's answer, which never comes before the pulse: the light stays long enough.
+        # Counted from the box's reply, which never precedes the pulse: the light stays long enough.
         with timings.on("exposure"):
             self._sleep(step.exposure)
         with timings.on("lights"):
@@ -105,23 +105,23 @@ class Exposing:
             projectors.line(step.projector, step.row, step.level)
 
     def _check_lamps(self, step: Step) -> None:
-        """Raise where lamps went off in mid-exposure: the frame would pass for a dark picture."""
+        """Raise where lamps went off during the exposure: the frame would look like a dark one."""
         lights = self._devices.lights
         if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
             return
         status, expected = lights.status(), 1 if step.kind == "olat" else lights.count
         if status.lit != expected:
-            doing = f"looking after the exposure of step {step.index} ({step.light or step.kind})"
+            doing = f"counting lit lamps after step {step.index} ({step.light or step.kind})"
             received, todo = f"{status.lit} lit{status.causes}", mismatch_todo(expected, status)
             lights.contradicted |= CONTRADICTED in todo
             raise DeviceError(lights.name, doing, lamps_lit(expected), received, todo)
 
     def _check_projectors(self, step: Step) -> None:
-        """The same for projectors, which go dark when nobody feeds their watchdog."""
+        """The same for projectors."""
         beams = self._devices.projectors
         projected = step.kind in ("scanline", "tracking")
         if projected and beams is not None and beams.capabilities.reads_back and beams.is_dark():
-            doing = f"looking after the exposure of step {step.index}"
+            doing = f"reading the projectors after the exposure of step {step.index}"
             todo = "Its watchdog switched it off, or it lost power: check its cable."
             raise DeviceError(beams.name, doing, "the row shown", "darkness", todo)
 
@@ -131,9 +131,9 @@ class Exposing:
 
 
 class FlashWatch:
-    """Measures the flash rate while running. Call it as each step's light is about to go on.
+    """Measures the flash rate while running. Call it right before each step's light.
 
-    Raises `SafetyRefusal` before the flash that makes the rate fall into the band.
+    Raises `SafetyRefusal` before the flash that would bring the rate into the band.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

@@ -12,17 +12,17 @@ from reconstruction.capture.folder import FrameRecord
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
 THREADS = (os.cpu_count() or 1) + 2
-"""Threads that convert, hash and write side by side: one a processor, and one each that waits for
-the disk while it writes and while it flushes."""
+"""Threads that convert, hash and write: one per processor, one that waits for the disk's writes and
+one for its flushes."""
 FEWEST_STEPS, MOST_STEPS = 2, 8
 SMALL_BYTES = 32 << 20
 
 
 def queued_frames(rig: Rig) -> int:
-    """How many of the rig's frames may wait for the disk before the sequence waits, too.
+    """How many frames may be queued for the disk before the sequence waits for it.
 
-    Those of two steps, and of up to eight while they have no more than `SMALL_BYTES` together: a
-    flush takes nearly as long for a few small files as for many.
+    Those of two steps, and of up to eight while they have at most `SMALL_BYTES` together: a flush
+    takes nearly as long for a few small files as for many.
     """
     step = sum(12 * c.width * c.height for c in rig.cameras)  # float32 RGB
     return len(rig.cameras) * min(max(SMALL_BYTES // step, FEWEST_STEPS), MOST_STEPS)
@@ -43,8 +43,8 @@ class Shot:
 class FrameWriter:
     """Converts and writes frames on threads of its own; at most `capacity` are under way.
 
-    One thread puts. Frames are stored side by side and journalled in the order of `put`, so a
-    crash leaves a capture without gaps, and costs at most `capacity` frames.
+    One thread calls `put`. Frames are stored in parallel and journalled in the order of `put`: a
+    crash leaves no gap and loses at most `capacity` frames.
     """
 
     def __init__(self, writer: CaptureWriter, capacity: int) -> None:
@@ -63,15 +63,15 @@ class FrameWriter:
             thread.start()
 
     def put(self, shot: Shot) -> None:
-        """Hand over a frame; waits while there are too many. Raises what writing raised."""
+        """Queue a frame; waits while the queue is full. Raises what writing raised."""
         self._room.acquire()
         try:
             self.check()
         except Exception:
-            self._room.release()  # for whoever tries again
+            self._room.release()
             raise
         number = self._next_put
-        self._next_put += 1  # first: the frame that is put last must find itself the last
+        self._next_put += 1  # before the queue: `_next_in_order` compares with it
         self._queue.put((number, shot))
 
     def check(self) -> None:
@@ -80,14 +80,14 @@ class FrameWriter:
             raise self._error
 
     def close(self) -> None:
-        """Write what waits, then stop. Raises what writing raised."""
+        """Write the queued frames, then stop. Raises what writing raised."""
         for _ in self._threads:
             self._queue.put(None)
         for thread in self._threads:
             thread.join()
         try:
-            if not self._committing:  # no commit failed: what a failed frame left is whole
-                self._commit_what_is_due()
+            if not self._committing:  # no commit failed
+                self._commit_in_order()
         finally:
             self.check()
 
@@ -97,7 +97,7 @@ class FrameWriter:
                 continue
             try:
                 self._write(*item)
-            except Exception as error:  # handed to the sequencer by `check`
+            except Exception as error:  # raised by `check`
                 self._error = self._error or error
                 self._room.release()  # or `put` would wait for ever
 
@@ -119,19 +119,19 @@ class FrameWriter:
         )
         with self._lock:
             self._stored[number] = record
-            if self._committing:  # whoever is at it goes on with this one
+            if self._committing:  # the committing thread takes this one, too
                 return
             self._committing = True
-        self._commit_what_is_due()
+        self._commit_in_order()
 
-    def _commit_what_is_due(self) -> None:
+    def _commit_in_order(self) -> None:
         while batch := self._next_in_order():
             self._writer.commit(batch)
             self._room.release(len(batch))
 
     def _next_in_order(self) -> list[FrameRecord]:
-        """The stored frames whose turn it is, once they are many or no other is under way: a
-        flush holds up what others write meanwhile, and many flush as fast as one."""
+        """The stored frames that are next, once they are half a queue or no other is under way: a
+        flush delays other writes, and takes as long for many frames as for one."""
         batch = []
         with self._lock:
             many = len(self._stored) >= self._batch

@@ -24,11 +24,11 @@ POLL_S = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """What a run gave: each camera's frames in the order they came, and how far the box got.
+    """What a run made: each camera's frames in order of arrival, and how far the box came.
 
-    `error` is why the run ended early, unless it was asked to; frames of the steps that were done
-    by then are good, one of a pulse beyond them was cut short. There are none where the devices'
-    positions could not confirm them after such an error.
+    `error` is why the run ended early, unless it was stopped on request. Frames of finished steps
+    are good; the frame of a later pulse was cut short. There are no frames where the positions of
+    lamps and projectors could not confirm them after such an error.
     """
 
     frames: dict[str, list[Frame]]
@@ -37,11 +37,7 @@ class Shots:
 
 
 class HardwareRun:
-    """One run on an armed stage; `shoot` blocks, `stop_requested` is looked at while it runs.
-
-    `schedule` has the seconds from the first pulse at which each step's pulse is due; `steady` says
-    that nothing but the box decides on them.
-    """
+    """One run on an armed stage. `shoot` blocks and polls `stop_requested` meanwhile."""
 
     def __init__(
         self,
@@ -60,21 +56,20 @@ class HardwareRun:
             for s in steps
         ]
         self._rows = [replace(row, repeat=len(list(same))) for row, same in groupby(each)]
-        self.steady = not any("P" in r.gates for r in each)  # projectors hold the box up
-        self.schedule = list(accumulate((r.period_s for r in each[:-1]), initial=0.0))
+        self._schedule = list(accumulate((r.period_s for r in each[:-1]), initial=0.0))
 
     def shoot(
         self, cameras: FanOut, cancel: threading.Event, stop_requested: Callable[[], bool]
     ) -> Shots:
-        """Run the table and collect what the cameras make of it.
+        """Run the table and collect the frames.
 
         Raises `DeviceError` where a device fails, `IndexShift` where lamps or projectors did not
-        step with the box; `Cancelled` where `cancel` was set.
+        step with the box, `Cancelled` where `cancel` was set.
         """
         lights, beams = self._devices.lights, self._devices.projectors
         trigger = self._devices.trigger
         settle = self._devices.config.lights.settle_s
-        begins = zip(self._steps, self.schedule, strict=True)
+        begins = zip(self._steps, self._schedule, strict=True)
         lit = [(s, (at, at + settle + s.exposure)) for s, at in begins if _gate(s) == "L"]
         shown = [_pattern(s) for s in self._steps if _gate(s) == "P"]
         if lit:
@@ -93,14 +88,14 @@ class HardwareRun:
         finally:
             watch.end()
         progress = watch.progress
-        asked = progress.state == "stopped" and progress.reason == "stop"
-        early = None if asked or progress.state == "done" else self._early(progress)
+        requested = progress.state == "stopped" and progress.reason == "stop"
+        early = None if requested or progress.state == "done" else self._early(progress)
         try:
             self._check_stepped(progress)
         except DeviceError:
             if early is None:
                 raise
-            frames = {name: [] for name in frames}  # nobody can vouch for them
+            frames = {name: [] for name in frames}  # their lights are not confirmed
         return Shots(frames, progress, early)
 
     def _collect(
@@ -108,7 +103,7 @@ class HardwareRun:
     ) -> list[Frame]:
         frames: list[Frame] = []
         while True:
-            # Looked at before reading: what the last pulse made is there when the box is done.
+            # Checked before reading: the last pulse's frame is there once the box is done.
             last_look = over.is_set()
             frame = camera.read(cancel)
             if frame is not None:
@@ -129,14 +124,14 @@ class HardwareRun:
             expected = "a watchdog that was fed"
             received = "a tripped one: frames of this run may be dark"
             todo = "Check the load of the host and the link; raise watchdog_s."
-            doing = "looking after a hardware-stepped run"
+            doing = "checking the watchdog after a hardware-stepped run"
             raise DeviceError(lights.name, doing, expected, received, todo)
         stepped: list[tuple[str, LightBank | ProjectorController]] = [("L", lights)] if lit else []
         if shown and beams is not None:
             stepped.append(("P", beams))
         for gate, device in stepped:
-            # Where a table is stopped in a step, that step's gate may have been open, too; in the
-            # exposure it was, but a bank that interlock or watchdog stopped no longer counts.
+            # The gate of the step in which a table was stopped may have been open; during the
+            # exposure it was, but a bank stopped by interlock or watchdog no longer counts.
             least, most = (self._gates(gate, progress.steps + more) for more in (0, 1))
             if progress.reason == "stop" and progress.pulses > progress.steps:
                 least = most
@@ -163,13 +158,13 @@ class HardwareRun:
 _TODO = {
     "interlock": "Close the interlock at the stage; the service never does.",
     "estop": "Release the emergency stop at the stage; the service never does.",
-    "watchdog": "The box heard nothing from the service: check the cable and the host's load.",
+    "watchdog": "The box received no request in time: check the cable and the host's load.",
     "no-pattern": "The projectors raised no trigger-out: check its cable and the projectors.",
 }
 
 
 class _Watch:
-    """Asks the box how far it is, which feeds its watchdog, until the table is over."""
+    """Polls the box's progress, which feeds its watchdog, until the table is over."""
 
     def __init__(self, devices: DeviceSet, stop_requested: Callable[[], bool]) -> None:
         self.over = threading.Event()
@@ -205,7 +200,7 @@ class _Watch:
                     return
                 if self._stop_asked():
                     self._trigger.stop()
-        except Exception as error:  # handed over by `progress`
+        except Exception as error:  # raised by `progress`
             self._error = error
         finally:
             self.over.set()

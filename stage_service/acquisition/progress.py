@@ -1,4 +1,4 @@
-"""What a run is at, and how long the rest will take by what was measured."""
+"""Progress of a run, and the remaining seconds as measured so far."""
 
 from __future__ import annotations
 
@@ -13,28 +13,27 @@ from reconstruction.capture.folder import StepKind
 from stage_service.acquisition.states import Progress
 
 NOTIFY_S = 0.2
-"""From one time that progress is told to the next, at least: who looks must not slow the run."""
+"""Shortest interval between two progress events, so that listeners do not slow the run."""
 MEASURED = 25
-"""The newest steps of a kind tell how long the next ones take."""
+"""Steps of a kind, the newest, whose durations predict the next."""
 ENOUGH = 3
-"""So many steps must have been measured."""
+"""Measured steps below which nothing is predicted."""
 
 
 class StepDurations:
-    """Seconds that a step of each kind took, at the median of the newest: one that is slow because
-    a camera warms up, or was shot again, says nothing of the rest."""
+    """Seconds per step of each kind: the median of the newest, robust to a single slow step."""
 
     def __init__(self) -> None:
         self._took: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MEASURED))
 
     def took(self, steps: Sequence[Step], seconds: float) -> None:
-        """These steps together took so long."""
+        """Record that these steps together took `seconds`."""
         for step in steps:
             self._took[step.kind].append(seconds / len(steps))
 
     def left(self, todo: Mapping[StepKind, int]) -> float | None:
-        """Seconds for so many steps of each kind; those of a kind that was not measured yet take as
-        long as the others. None where too few were."""
+        """Seconds for `todo` steps of each kind; an unmeasured kind takes the median of all. None
+        while fewer than `ENOUGH` were measured."""
         known = [t for took in self._took.values() for t in took]
         if len(known) < ENOUGH:
             return None
@@ -44,21 +43,21 @@ class StepDurations:
 
 
 class RunProgress:
-    """One run over `steps`; `frames` are those of each camera that were there before it.
+    """One run over `steps`; `frames` counts each camera's frames from before the run.
 
-    Cameras' threads may say that a frame has arrived; all else is one thread's. `tell` hears of
-    it, at most every `NOTIFY_S` seconds.
+    `answered` and `came` may be called from cameras' threads, all else from one thread. `notify`
+    is called with the progress, at most every `NOTIFY_S` seconds.
     """
 
     def __init__(
         self,
         steps: Iterable[Step],
         frames: Mapping[str, int],
-        tell: Callable[[Progress], object],
+        notify: Callable[[Progress], object],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.again = 0
-        self._tell, self._clock = tell, clock
+        self._notify, self._clock = notify, clock
         self._todo = Counter(step.kind for step in steps)
         self._lock = threading.RLock()
         self._frames = dict(frames)
@@ -67,12 +66,12 @@ class RunProgress:
         self._step: Step | None = None
         self._here = 0
         self._run: Sequence[Step] = ()
-        self._came = dict.fromkeys(frames, 0)  # of the box's run that is under way
-        self._began = self._first_at = self._told_at = 0.0
-        self._told: Progress | None = None
+        self._came = dict.fromkeys(frames, 0)  # in the current hardware-stepped run
+        self._began = self._first_at = self._notified_at = 0.0
+        self._notified: Progress | None = None
 
     def skip(self, steps: Iterable[Step]) -> None:
-        """These were shot before this run."""
+        """Count steps that were shot before this run."""
         for step in steps:
             self._count(step)
 
@@ -80,45 +79,45 @@ class RunProgress:
         """The service is about to light this step."""
         with self._lock:
             self._step, self._began, self._here = step, self._clock(), 0
-        self._say()
+        self._publish()
 
     def answered(self) -> None:
-        """One more camera has, of those that the service's own step waits for."""
+        """One more camera has replied for the current software-stepped step."""
         with self._lock:
             self._here += 1
-        self._say()
+        self._publish()
 
     def arrived(self, camera: str) -> None:
-        """A frame of the service's own step has."""
+        """Count a frame of the current software-stepped step."""
         with self._lock:
             self._frames[camera] += 1
 
     def done(self, step: Step) -> None:
-        """This step is over."""
+        """Count a finished step."""
         with self._lock:
             if self._step is step:
                 self._durations.took([step], self._clock() - self._began)
             self._count(step)
             self._here = 0
-        self._say()
+        self._publish()
 
     def begin_run(self, steps: Sequence[Step]) -> None:
         """The trigger box is about to clock these."""
         with self._lock:
             self._run, self._began = steps, self._clock()
             self._came = dict.fromkeys(self._frames, 0)
-        self._say()
+        self._publish()
 
     def came(self, camera: str) -> None:
-        """A frame of the box's run has arrived."""
+        """Count a frame of the hardware-stepped run."""
         with self._lock:
             self._came[camera] += 1
             if self._live == 1 and self._came[camera] == 1:
                 self._first_at = self._clock()
-        self._say()
+        self._publish()
 
     def end_run(self, kept: Mapping[str, int]) -> None:
-        """It is over; so many frames of each camera are good."""
+        """End the hardware-stepped run, with the good frames of each camera."""
         with self._lock:
             if self._live:
                 self._durations.took(self._run[: self._live], self._clock() - self._began)
@@ -127,7 +126,7 @@ class RunProgress:
             self._run, self._came = (), dict.fromkeys(self._frames, 0)
 
     def now(self) -> Progress:
-        """Where it is."""
+        """The present progress."""
         with self._lock:
             live = self._live
             step = self._run[min(live, len(self._run) - 1)] if self._run else self._step
@@ -144,14 +143,14 @@ class RunProgress:
 
     @property
     def _live(self) -> int:
-        """Steps of the box's run of which every camera has its frame."""
+        """Steps of the hardware-stepped run of which every camera has its frame."""
         return min(len(self._run), *self._came.values()) if self._came else 0
 
     def _left(self, live: int) -> float | None:
         todo = self._todo.copy()
         if live < 2:
             return self._durations.left(todo)
-        each = (self._clock() - self._first_at) / (live - 1)  # without what the first waited for
+        each = (self._clock() - self._first_at) / (live - 1)  # without the wait for the first
         todo.subtract(step.kind for step in self._run)
         others = self._durations.left(todo)
         rest = each * todo.total() if others is None else others
@@ -163,16 +162,16 @@ class RunProgress:
             self._todo[step.kind] -= 1
 
     def waiting(self) -> None:
-        """The run still waits: tell what came too soon after the last time to be told."""
-        self._say()
+        """Notify of what the interval held back."""
+        self._publish()
 
-    def _say(self) -> None:
+    def _publish(self) -> None:
         with self._lock:
             now = self._clock()
-            if now - self._told_at < NOTIFY_S:
+            if now - self._notified_at < NOTIFY_S:
                 return
             progress = self.now()
-            if progress == self._told:
+            if progress == self._notified:
                 return
-            self._told_at, self._told = now, progress
-        self._tell(progress)
+            self._notified_at, self._notified = now, progress
+        self._notify(progress)

@@ -1,4 +1,4 @@
-"""Lights off, verified; and no light while the stage says no.
+"""Blackout with read-back, and the check of interlocks before anything is armed.
 
 Software is not the safety function: the light bank's own watchdog and the wired emergency stop are.
 """
@@ -6,7 +6,6 @@ Software is not the safety function: the light bank's own watchdog and the wired
 from __future__ import annotations
 
 import atexit
-import queue
 import signal
 import sys
 import threading
@@ -16,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
+from stage_service.background import beside
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import CONTRADICTED, LightBank, LightStatus
@@ -24,17 +24,17 @@ from stage_service.devices.trigger.interface import TriggerStatus
 
 ATTEMPTS = 3
 WITHIN_S = 30.0
-"""A device that has not answered by then is not waited for any longer."""
+"""Seconds that a blackout waits for one device."""
 Darkness = Literal["dark", "said to be dark", "unknown, unsafe"]
 
 
 @dataclass(frozen=True)
 class Blackout:
-    """What a blackout came to: `safe` only if every lamp and projector was read back dark.
+    """Result of a blackout: `safe` only if every lamp and projector was read back dark.
 
-    `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank cannot
-    read it back (`accept_unverified_blackout`); or somebody has looked, and `said` that it is dark
-    where no link can tell. `known_at`: when, in monotonic seconds.
+    `accepted`: off was sent, nothing failed, and the rig file accepts that the light bank has no
+    read-back (`accept_unverified_blackout`); or a person has looked and acknowledged darkness
+    (`said`) that no link can read back. `known_at`: monotonic seconds.
     """
 
     safe: bool
@@ -45,26 +45,26 @@ class Blackout:
 
     @property
     def state(self) -> Darkness:
-        """What is known of the lamps."""
+        """The lamps' state."""
         if self.safe:
             return "dark"
         return "said to be dark" if self.said else "unknown, unsafe"
 
     @property
     def blocks(self) -> bool:
-        """Whether this fails a capture, and the next one may not begin."""
+        """Whether this fails the capture and refuses the next one."""
         return not (self.safe or self.accepted)
 
     def to_dict(self) -> dict[str, Any]:
-        """What the API, events and manifests tell of it."""
+        """As the API, events and manifests have it."""
         return {"safe": self.safe, "state": self.state, "detail": self.detail}
 
 
 def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WITHIN_S) -> Blackout:
-    """Put lamps and projectors off, side by side, and read it back; never raises for a device.
+    """Put lamps and projectors off, in parallel, and read them back; never raises for a device.
 
-    A device that fails is tried again on a new connection. What cannot be verified, or not
-    `within_s` seconds, is reported as "unknown, unsafe"; what is late is still tried.
+    A device that fails is tried again on a new connection. A device not verified within `within_s`
+    seconds is reported as "unknown, unsafe"; its attempts go on.
     """
     lights, beams, config = devices.lights, devices.projectors, devices.config
     problems = unread = ""
@@ -73,17 +73,18 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
     if beams is not None:
         lit.append((beams, beams.is_dark))
     found = [
-        _beside(
-            partial(_darken, device, is_dark if device.capabilities.reads_back else None, attempts)
+        beside(
+            partial(_darken, device, is_dark if device.capabilities.reads_back else None, attempts),
+            "blackout",
         )
         for device, is_dark in lit
     ]
     deadline = time.monotonic() + within_s
-    for (device, _), answer in zip(lit, found, strict=True):
+    for (device, _), result in zip(lit, found, strict=True):
         can = device.capabilities
         try:
-            problem = answer.get(timeout=max(0.0, deadline - time.monotonic()))
-        except queue.Empty:
+            problem = result.result(timeout=max(0.0, deadline - time.monotonic()))
+        except TimeoutError:
             problem = f" {device.name}: not dark within {within_s:.3g} s."
         if problem and can.dead_man:
             problem += (
@@ -103,24 +104,10 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
     return Blackout(False, f"unknown, unsafe: {(problems + unread).strip()}", accepted)
 
 
-def _beside(work: Callable[[], str]) -> queue.SimpleQueue[str]:
-    """Where the answer of `work`, on a thread of its own, will be."""
-    answer: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def run() -> None:
-        answer.put(work())
-
-    try:
-        threading.Thread(target=run, name="blackout", daemon=True).start()
-    except RuntimeError:  # the interpreter is ending, or no thread can be had
-        run()
-    return answer
-
-
 def _darken(
     device: LightBank | ProjectorController, is_dark: Callable[[], bool] | None, attempts: int
 ) -> str:
-    """Empty when the device is dark as far as it can tell, else what went wrong the last time."""
+    """Empty once the device is off, as far as it reads back; else the last attempt's problem."""
     problem = ""
     for attempt in range(attempts):
         if attempt:
@@ -132,7 +119,7 @@ def _darken(
             problem = f" {device.name}: still lit after off."
         except DeviceError as error:
             problem = f" {error}"
-        except Exception as error:  # whatever it is, the next device must still be darkened
+        except Exception as error:  # any error: the result must report it
             problem = f" {device.name}: {type(error).__name__}: {error}"
     return problem
 
@@ -153,10 +140,10 @@ def check_interlocks(devices: DeviceSet) -> None:
 
 
 def off_on_exit(close: Callable[[], None]) -> Callable[[], None]:
-    """Have `close` called when the process ends, by SIGTERM too; returns what undoes that.
+    """Call `close` when the process ends, by SIGTERM too; returns a function that undoes this.
 
-    SIGTERM is turned into `SystemExit` where nobody else handles it; a server that does handle
-    it ends in `atexit` as well.
+    SIGTERM becomes `SystemExit` where no other handler is set; a server with a handler of its own
+    reaches `atexit` as well.
     """
 
     def terminate(number: int, _frame: object) -> None:

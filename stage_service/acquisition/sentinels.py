@@ -14,9 +14,9 @@ from reconstruction.arrays import Floats
 from stage_service.devices.errors import IndexShift
 
 LEAST_CONTRAST = 8.0
-"""Counts by which all-on must exceed dark on the brightest part of the picture to say anything."""
+"""Counts by which all-on must exceed dark on the brightest part of the picture."""
 BRIGHTEST = 0.1
-"""Share of pixels that is looked at: those where lamps make the largest difference."""
+"""Share of pixels that is compared: those where lamps make the largest difference."""
 CHANGED = 0.5
 """Share of the contrast by which a sentinel may differ between begin and end: subjects move."""
 
@@ -24,9 +24,9 @@ CHANGED = 0.5
 def check_sentinels(capture: Capture) -> dict[str, str]:
     """Compare the first and last dark and all-on frames of every camera.
 
-    Returns, by camera, why nothing could be told where it could not: frames missing, or lamps make
-    no difference in the picture. Raises `IndexShift` that names every camera whose pictures
-    contradict the plan.
+    Returns, by camera, why it could not be compared: frames are missing, or lamps make no
+    difference in its picture. Raises `IndexShift` that names every camera whose pictures contradict
+    the plan.
     """
     dark, bright = _ends(capture, "dark"), _ends(capture, "all_on")
     if dark is None or bright is None:
@@ -53,7 +53,7 @@ def check_sentinels(capture: Capture) -> dict[str, str]:
     if wrong:
         doing = "comparing the pictures at both ends of the capture"
         expected = "dark frames without light and all-on frames alike"
-        todo = "Frames may stand for other steps, or lamps failed: check the trigger cables and "
+        todo = "Frames may show other steps, or lamps failed: check the trigger cables and "
         todo += "the lamps, and shoot this capture again."
         raise IndexShift("cameras", doing, expected, "; ".join(wrong), todo)
     return unclear

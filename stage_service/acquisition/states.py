@@ -1,4 +1,4 @@
-"""Where a capture is and how it ended: one table for the sequencer, the API and the tests."""
+"""State and outcome of a capture: one table for the sequencer, the API and the tests."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ TRANSITIONS: dict[State, dict[str, State]] = {
     "finishing": {"finish": "done", "fail": "finishing"},
     "done": {"continue": "running"},
 }
-"""state -> action -> next state; whatever is not listed is refused.
+"""state -> action -> next state; an action that is not listed is refused.
 
-"pause" and "abort" are asked for, "hold" and "stop" are when the run, dark, has heeded them; the
-step under way may complete it before. "continue" shoots what a capture lacks that is done and did
-not complete: a new run, which starts where the table says that a run starts.
+A person requests "pause" and "abort"; "hold" and "stop" follow once the run is dark. The step under
+way may complete the capture before. "continue" is a new run over the frames that an ended,
+incomplete capture lacks.
 """
 
 OUTCOMES: dict[str, Outcome] = {"complete": "completed", "stop": "aborted", "fail": "failed"}
-"""The outcome that the action decides; a later failure wins over an earlier success."""
+"""The outcome that an action decides; a later failure replaces an earlier success."""
 
 
 def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
@@ -46,19 +46,30 @@ def possible(state: State, outcome: Outcome | None) -> dict[str, State]:
 
 
 REQUESTABLE = {"abort": "abort", "pause": "pause", "resume": "resume", "continue": "resume"}
-"""The actions that are for a person to ask for, and by which word; all others are the run's own."""
+"""Actions that a person may request, and the request's name; all others are the run's own."""
 
 
 class WrongState(RuntimeError):
-    """The state does not allow the action; the message lists what can be asked for."""
+    """The state does not allow the action; the message lists what may be requested."""
 
     def __init__(self, action: str, state: State, outcome: Outcome | None = None) -> None:
         verbs = (REQUESTABLE[a] for a in possible(state, outcome) if a in REQUESTABLE)
         allowed = ", ".join(sorted(verbs)) or "nothing"
         known = f"{state} ({outcome})" if state == "done" and outcome else state
-        told = f"cannot {action} a capture that is {known}; possible now: {allowed}"
-        super().__init__(told)
+        super().__init__(f"cannot {action} a capture that is {known}; possible now: {allowed}")
         self.action, self.state = action, state
+
+
+class CannotPause(WrongState):
+    """The trigger box clocks these steps and cannot wait."""
+
+    def __init__(self, steps: int) -> None:
+        RuntimeError.__init__(
+            self,
+            f"cannot pause: the trigger box clocks a run of {steps} steps by itself. Pause after "
+            "this run, or abort: that stops the box at once and keeps the frames of finished steps",
+        )
+        self.action, self.state = "pause", "running"
 
 
 class Machine:
@@ -82,12 +93,11 @@ class Machine:
 
 
 class Progress(BaseModel):
-    """What a run is at: the step's light, or projector and row; `by_box`: the trigger box clocks.
+    """Progress of a run: the step's light, or projector and row; `by_box`: the trigger box clocks.
 
-    `step` counts steps whose frames have all arrived, `frames` those of each camera that have,
-    `here` cameras that have answered for the step that is being waited for;
-    `again` frames that are shot again. `seconds_left` goes by the steps that were measured: None
-    while they are too few, and not counting a pause.
+    `step` counts steps of which all frames have arrived, `frames` each camera's frames, `here`
+    cameras that have replied for the current step, `again` frames that are shot again.
+    `seconds_left` is extrapolated from measured steps, without pauses: None while they are too few.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -105,12 +115,11 @@ class Progress(BaseModel):
 
 
 class CaptureStatus(BaseModel):
-    """One capture: `state` says where it is, `outcome` how it ended (None while it is not done).
+    """One capture: its `state`, and its `outcome` (None until it is done).
 
-    `error` is what went wrong; while it is paused, which device does not answer.
-    `step` counts steps done of `steps`; `frames_missing` counts frames given up after all
-    retries; `request` is what was given to `CaptureManager.start` as `extra`; `progress` is there
-    while it is shot.
+    `error` names what failed; during a pause, a device that does not reply. `step` counts finished
+    steps of `steps`, `frames_missing` frames given up after all retries. `request` is the
+    `extra` of `CaptureManager.start`; `progress` is set while it is shot.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -134,13 +143,13 @@ class CaptureStatus(BaseModel):
 
 
 def read_status(path: Path) -> CaptureStatus:
-    """The status of a capture folder that nobody is shooting: done, interrupted without manifest.
+    """The status of a capture folder that is not being shot; interrupted without a manifest.
 
-    Whatever is wrong with it, it is "damaged", with the reason as `error`; never raises.
+    An unreadable folder is "damaged", with the reason as `error`; never raises.
     """
     try:
         return _read_status(path)
-    except Exception as error:  # one folder must not keep the others, or the service, from working
+    except Exception as error:  # one bad folder must not stop the service
         reason = str(error) if isinstance(error, ValueError | OSError) else repr(error)
         if isinstance(error, ValidationError):
             reason = f"plan.json or manifest.json: {sentence(error)}"

@@ -1,4 +1,4 @@
-"""Where the time of a capture went."""
+"""Seconds of a capture by cause."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from statistics import median
 
 
 class Timings:
-    """Seconds by cause, and what is left of each step for the service's own work.
+    """Seconds by cause, and the rest of each step: the service's own work.
 
     One thread uses it. Causes must not be nested.
     """
@@ -30,7 +30,7 @@ class Timings:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """A step: what none of its causes explains is the service's own."""
+        """Time a step; the part without a cause counts as "service"."""
         began, before = time.perf_counter(), sum(self.seconds.values())
         yield
         explained = sum(self.seconds.values()) - before

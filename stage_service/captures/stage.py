@@ -183,7 +183,7 @@ class Stage:
 
     @cached_property
     def _seen(self) -> CachedStatus:
-        return CachedStatus(self._look, self.devices.unseen())
+        return CachedStatus(self._look, self.devices.unqueried())
 
     def _look(self) -> dict[str, Any] | None:
         """Ask the devices; without a capture, connect for the answer, until one begins."""

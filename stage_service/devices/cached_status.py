@@ -1,4 +1,4 @@
-"""What the devices said of themselves when they were last asked, so that nobody waits for them."""
+"""The newest status of devices or disks, so that readers do not wait for them."""
 
 from __future__ import annotations
 
@@ -9,56 +9,57 @@ from contextlib import suppress
 from typing import Any
 
 WAIT_S = 2.0
-"""How long somebody who asks waits for an answer that is under way."""
+"""Seconds that a reader waits for a query that is under way."""
 
 
 class CachedStatus:
-    """Asks one at a time, on a thread of its own, however many want to know.
+    """Runs one query at a time, on a thread of its own, for any number of readers.
 
-    `look()` returns what it saw, or None where it gave up; before the first look it is `unseen`.
+    `query()` returns the status, or None where it gave up; until the first result it is `initial`.
     """
 
     def __init__(
         self,
-        look: Callable[[], dict[str, Any] | None],
-        unseen: dict[str, Any],
+        query: Callable[[], dict[str, Any] | None],
+        initial: dict[str, Any],
         wait_s: float = WAIT_S,
     ) -> None:
-        self._look, self._seen, self._wait_s = look, unseen, wait_s
+        self._query, self._status, self._wait_s = query, initial, wait_s
         self._at: float | None = None
         self._began = 0.0
-        self._looking = False
+        self._running = False
         self._changed = threading.Condition()
 
     def get(self) -> dict[str, Any]:
-        """What was seen last and, as "age_s", how many seconds ago (None: not yet)."""
+        """The newest status and its age in seconds, "age_s" (None before the first); starts a
+        query and waits for it at most `wait_s`."""
         with self._changed:
-            if not self._looking:
+            if not self._running:
                 self._began = time.monotonic()
-                with suppress(RuntimeError):  # no thread can be had: its age tells
-                    threading.Thread(target=self._run, name="device-look", daemon=True).start()
-                    self._looking = True
-            self._changed.wait_for(lambda: not self._looking, self._wait_s)
+                with suppress(RuntimeError):  # no thread available: the status only grows older
+                    threading.Thread(target=self._run, name="status-query", daemon=True).start()
+                    self._running = True
+            self._changed.wait_for(lambda: not self._running, self._wait_s)
             age = None if self._at is None else time.monotonic() - self._at
-            return {**self._seen, "age_s": age}
+            return {**self._status, "age_s": age}
 
-    def looking_s(self) -> float:
-        """How long the look that is under way has taken; 0 where none is."""
+    def running_s(self) -> float:
+        """Seconds that the present query has taken; 0 without one."""
         with self._changed:
-            return time.monotonic() - self._began if self._looking else 0.0
+            return time.monotonic() - self._began if self._running else 0.0
 
     def peek(self) -> dict[str, Any]:
-        """What was seen last; has nobody look."""
+        """The newest status, without a query."""
         with self._changed:
-            return dict(self._seen)
+            return dict(self._status)
 
     def _run(self) -> None:
-        seen, at = None, time.monotonic()
+        status, at = None, time.monotonic()
         try:
-            seen = self._look()
+            status = self._query()
         finally:
             with self._changed:
-                if seen is not None:
-                    self._seen, self._at = seen, at
-                self._looking = False
+                if status is not None:
+                    self._status, self._at = status, at
+                self._running = False
                 self._changed.notify_all()

@@ -21,7 +21,7 @@ from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.interface import LightBank
-from stage_service.devices.lights.limited import LimitedLightBank, LitTimes
+from stage_service.devices.lights.limited import LimitedLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.interface import ProjectorController
 from stage_service.devices.projectors.pjlink import PjLinkProjector, Power
@@ -41,7 +41,7 @@ class NoStage(RigError):
 class DeviceSet:
     """The drivers of a stage; `projectors` is None where it has none.
 
-    `powers` are the projectors whose power can be asked for.
+    `powers` are the projectors whose power state can be read.
     """
 
     config: DevicesConfig
@@ -52,11 +52,8 @@ class DeviceSet:
     powers: tuple[PjLinkProjector, ...] = ()
 
     @classmethod
-    def of(cls, rig_file: RigFile, lit: LitTimes | None = None) -> Self:
-        """Make the drivers; connects to nothing. Raises `NoStage`, `RigError`.
-
-        `lit` has how long lamps were lit before, for their duty, and goes on being kept.
-        """
+    def of(cls, rig_file: RigFile) -> Self:
+        """Make the drivers; connects to nothing. Raises `NoStage`, `RigError`."""
         config, rig = rig_file.devices, rig_file.rig
         if config is None:
             raise NoStage(f"{rig_file.path}: the table [devices] is missing: no stage to talk to")
@@ -76,9 +73,7 @@ class DeviceSet:
             projectors = SerialProjectorController(config.projectors, names)
         return cls(
             config,
-            LimitedLightBank(
-                lights, rig_file.safety, past=lit, lights=[light.name for light in rig.lights]
-            ),
+            LimitedLightBank(lights, rig_file.safety, lights=[light.name for light in rig.lights]),
             SerialTriggerBox(config.trigger),
             projectors,
             tuple(cameras),
@@ -104,7 +99,7 @@ class DeviceSet:
             if state is not Power.ON:
                 received = state.name.lower().replace("_", " ")
                 todo = "Switch it on, and wait until its lamp has warmed up."
-                doing = "looking before a sweep"
+                doing = "reading the power state before a sweep"
                 raise DeviceError(projector.name, doing, "power on", received, todo)
 
     def close(self) -> None:
@@ -115,30 +110,32 @@ class DeviceSet:
     def status(
         self, *, connect: bool, given_up: Callable[[], bool] = lambda: False
     ) -> dict[str, Any] | None:
-        """Ask each device how it is: {kind: {"state": "ok" | "unreachable", ...}}.
+        """Query each device: {kind: {"state": "ok" | "unreachable", ...}}.
 
-        With `connect` each device is connected first. Without it, as during a capture, the cameras
-        are left alone; a driver whose link is closed opens it to ask. None once `given_up`, which
-        is asked before each device.
+        With `connect` each device is connected first. Without it, as during a capture, cameras are
+        not queried; a driver whose link is closed opens it. None once `given_up()`, which is
+        checked before each device.
         """
         lights, trigger, beams = self.lights, self.trigger, self.projectors
-        asked: dict[str, Callable[[], dict[str, Any]]] = {
-            "lights": lambda: _ask(lights, connect, _lamps),
-            "trigger": lambda: _ask(
+        queries: dict[str, Callable[[], dict[str, Any]]] = {
+            "lights": lambda: _query(lights, connect, _lamps),
+            "trigger": lambda: _query(
                 trigger, connect, lambda t: {"pulses": t.count(), **asdict(t.status())}
             ),
         }
         if beams is not None:
-            asked["projectors"] = lambda: _ask(
+            queries["projectors"] = lambda: _query(
                 beams, connect, lambda b: {"dark": b.is_dark(), "names": list(b.names)}
             )
-        asked["cameras"] = self._ask_cameras if connect else lambda: self._cameras("in use")
-        asked["projector_power"] = lambda: {p.projector: _power(p) for p in self.powers if connect}
+        queries["cameras"] = self._query_cameras if connect else lambda: self._cameras("in use")
+        queries["projector_power"] = lambda: {
+            p.projector: _power(p) for p in self.powers if connect
+        }
         out = {}
-        for kind, ask in asked.items():
+        for kind, query in queries.items():
             if given_up():
                 return None
-            out[kind] = ask()
+            out[kind] = query()
         return out
 
     @property
@@ -147,9 +144,9 @@ class DeviceSet:
         beams = self.config.projectors
         return max(self.config.lights.timeout_s, 0.0 if beams is None else beams.timeout_s)
 
-    def unseen(self) -> dict[str, Any]:
-        """What `status` has while nobody knows: each device's state is "not asked yet"."""
-        state = "not asked yet"
+    def unqueried(self) -> dict[str, Any]:
+        """As `status`, before the first query: each device's state is "not queried yet"."""
+        state = "not queried yet"
         single: dict[str, Device | None]
         single = {"lights": self.lights, "trigger": self.trigger, "projectors": self.projectors}
         known = {k: {"name": d.name, "state": state} for k, d in single.items() if d is not None}
@@ -158,10 +155,10 @@ class DeviceSet:
     def _cameras(self, state: str) -> dict[str, Any]:
         return {camera.name: {"state": state} for camera in self.cameras}
 
-    def _ask_cameras(self) -> dict[str, Any]:
+    def _query_cameras(self) -> dict[str, Any]:
         cameras = FanOut(self.cameras)
         try:
-            return cameras(lambda camera: _ask(camera, True, lambda c: asdict(c.info)))
+            return cameras(lambda camera: _query(camera, True, lambda c: asdict(c.info)))
         finally:
             cameras.close()
 
@@ -189,7 +186,7 @@ def _powers(rig_file: RigFile, config: DevicesConfig) -> tuple[PjLinkProjector, 
         if name not in known:
             raise RigError(f"{where}: the rig has no projector {name!r}")
         file = link.password_file
-        # Read when it is needed: a file that is gone must not keep anybody from a blackout.
+        # Read on use: a missing file must not prevent a blackout.
         password = "" if file is None else rig_file.path.parent / file
         out.append(PjLinkProjector(name, link.host, link.port, password, link.timeout_s))
     return tuple(out)
@@ -208,10 +205,10 @@ def _lamps(lights: LightBank) -> dict[str, Any]:
     return {"count": lights.count, **known}
 
 
-def _ask(device: D, connect: bool, question: Callable[[D], dict[str, Any]]) -> dict[str, Any]:
+def _query(device: D, connect: bool, question: Callable[[D], dict[str, Any]]) -> dict[str, Any]:
     try:
         if connect:
             device.connect()
         return {"name": device.name, "state": "ok", **question(device)}
-    except Exception as error:  # whatever it is, the other devices are still to be asked
+    except Exception as error:  # any error: the other devices are still queried
         return {"name": device.name, "state": "unreachable", "error": str(error)}

@@ -1,10 +1,10 @@
-"""What goes wrong on a wire, told so that somebody can act on it."""
+"""Errors of devices, with what to do next."""
 
 from __future__ import annotations
 
 
 class DeviceError(RuntimeError):
-    """A device did not do what it was asked to.
+    """A device did not carry out a request.
 
     The message names the device, the operation, the deadline, what was expected and what was
     received, and what to do next; the same are attributes.
@@ -28,7 +28,7 @@ class DeviceError(RuntimeError):
 
 
 class DeviceTimeout(DeviceError):
-    """Nothing, or not enough, came before the deadline."""
+    """The device sent nothing, or not enough, before the deadline."""
 
 
 class DeviceUnreachable(DeviceError):
@@ -36,15 +36,15 @@ class DeviceUnreachable(DeviceError):
 
 
 class SafetyRefusal(DeviceError):
-    """What an interlock, the emergency stop or a limit of `[safety]` forbids.
+    """An interlock, the emergency stop or a limit of `[safety]` forbids the request.
 
-    Interlock and emergency stop are cleared by people at the stage, never from here.
+    People at the stage clear interlock and emergency stop; the service never does.
     """
 
 
 class IndexShift(DeviceError):
-    """Pulses and frames do not match: frames could stand for the wrong step."""
+    """Pulses and frames do not match: frames may be assigned to the wrong step."""
 
 
 class Cancelled(Exception):
-    """A wait was given up because the capture is being stopped at once."""
+    """A wait ended early because the capture is being stopped."""

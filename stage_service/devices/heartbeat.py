@@ -12,9 +12,8 @@ from stage_service.devices.projectors.interface import ProjectorController
 class Heartbeat:
     """A context in which the device gets a heartbeat every `interval_s` seconds.
 
-    One failed beat is tried again at the next; `error` is the newest's, None where it did not fail,
-    and `check` raises it. Each device needs its own: one that does not answer must not keep the
-    others waiting.
+    `error` is that of the newest beat, None where it succeeded; `check` raises it. Each device has
+    a heartbeat of its own, so that a slow one does not delay the others.
     """
 
     def __init__(self, device: LightBank | ProjectorController, interval_s: float) -> None:
@@ -44,5 +43,5 @@ class Heartbeat:
             try:
                 self._device.heartbeat()
                 self.error = None
-            except Exception as error:  # whatever it is, the thread goes on and `check` tells
+            except Exception as error:  # raised by `check`; the thread continues
                 self.error = error

@@ -1,4 +1,4 @@
-"""Which service has a stage: two must not drive one, whatever their root folders are."""
+"""One service to a stage: two must not drive the same devices, whatever their root folders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stage_service.records.lease import FileLock, LockedBy
 
 log = logging.getLogger("hairstage.ownership")
 RELEASE_S = 1.0
-"""A bank that hangs keeps a service for no longer from ending."""
+"""Seconds that the end of a service waits for a bank that hangs."""
 
 
 class StageInUse(DeviceError):
@@ -26,20 +26,19 @@ class StageInUse(DeviceError):
 
 
 class Ownership:
-    """A service's hold on the stage whose light bank is `bank`, by a name that others can read.
+    """A service's exclusive use of the stage whose light bank `config` describes.
 
-    On this machine it is a lock file, named for the bank's address, which the kernel frees when the
-    process dies. For services on other machines it is the bank's owner register, where it has one
-    (docs/reference/wire.md), which outlives the process: who finds the name of a dead process of
-    its own machine there takes its place, and `take_over` says that the one of another machine is
-    dead.
-    Making one raises `StageInUse` where the lock is held.
+    On this machine: a lock file named for the bank's address, which the kernel frees when the
+    process dies. Across machines: the bank's owner register, where it has one
+    (docs/reference/wire.md), which outlives the process. A service replaces the name of a dead
+    process of its own machine; `take_over` replaces that of another machine. Raises `StageInUse`
+    where the lock is held.
     """
 
     def __init__(self, config: LightBankConfig, root: Path, take_over: bool = False) -> None:
         self._host = _host()
         self._name = f"{self._host}:{os.getpid()}"
-        # The same after a restart, so that what this service has left is its own.
+        # The same number after a restart, so that a service recognises its own entry.
         self._number = zlib.crc32(f"{self._host}:{root.resolve()}".encode()) % 0xFFFF + 1
         self._take_over = take_over
         place = _place(config)
@@ -50,9 +49,9 @@ class Ownership:
             raise _in_use(f"light bank ({place})", str(error)) from error
 
     def claim(self, bank: LightBank) -> None:
-        """Have the bank say that this service has it; call it before lamps are commanded.
+        """Write this service into the bank's owner register, before lamps are commanded.
 
-        Raises `StageInUse`. A bank that does not answer belongs to nobody, and lights nothing.
+        Raises `StageInUse`. A bank that does not reply is taken as free: it lights nothing.
         """
         if not bank.capabilities.owned:
             return
@@ -63,13 +62,13 @@ class Ownership:
                 bank.claim(0, "")
                 held = bank.claim(self._number, self._name)
         except DeviceError as error:
-            log.warning("nobody can tell whether another service has this stage: %s", error)
+            log.warning("the stage's owner cannot be read: %s", error)
             return
         if held is not None:
             raise _in_use(bank.name, held)
 
     def release(self, bank: LightBank) -> None:
-        """Give the stage up; may be called again."""
+        """Release the stage; may be called again."""
         if bank.capabilities.owned:
             thread = threading.Thread(target=self._disown, args=(bank,), daemon=True)
             thread.start()
@@ -81,12 +80,12 @@ class Ownership:
             if bank.claim(self._number, self._name) is None:
                 bank.claim(0, "")
             bank.close()
-        except DeviceError:  # it is gone; so is whoever could have had it
+        except DeviceError:  # the bank is gone
             pass
 
 
 def _host() -> str:
-    """This machine's name in 24 characters, of which the last tell long ones apart."""
+    """This machine's name in 24 characters; long names end in a checksum."""
     host = socket.gethostname()
     return host if len(host) <= 24 else f"{host[:15]}-{zlib.crc32(host.encode()):08x}"
 
@@ -97,7 +96,7 @@ def _in_use(bank: str, holder: str) -> StageInUse:
 
 
 def _place(config: LightBankConfig) -> str:
-    """The bank's address, the same for everybody on this machine, as part of a file's name."""
+    """The bank's address as part of a file name, the same for every user of this machine."""
     if isinstance(config, ModbusTcpConfig):
         try:
             host = socket.gethostbyname(config.host)
@@ -110,6 +109,6 @@ def _place(config: LightBankConfig) -> str:
 
 
 def _folder() -> Path:
-    """Where every user of this machine may leave a lock."""
+    """A folder where every user of this machine may create a lock file."""
     shared = Path("/run/lock")
     return shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())

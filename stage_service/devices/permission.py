@@ -1,7 +1,7 @@
-"""The right of one run to put light on; the devices light nothing for a thread without it.
+"""The permission of one run to put light on; drivers light nothing for a thread without it.
 
-A thread lights by the permission that it uses (`Permission.used`), so that what is left of an
-earlier run can never light by the permission of a later one.
+A thread lights under the permission that it uses (`Permission.used`), so a thread left over from an
+earlier run can never light under the permission of a later one.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ class NotPermitted(RuntimeError):
 
 
 class Permission:
-    """Of the run `what`: live once it is granted, until it is revoked, which is final.
+    """The permission of the run `what`: live from `grant` to `revoke`, which is final.
 
-    While it is `suspended`, as in a pause, it is not live. No method but `lighting` and `no_light`
-    waits. Safe to call from several threads.
+    A suspended one, as in a pause, is not live. Only `lighting` and `no_light` wait. Safe to call
+    from several threads.
     """
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._state: State = "not granted"
-        self._why = "nobody has granted it"
+        self._why = "its permission is not granted"
         self._changing = threading.Lock()  # for moments
-        self._lighting = threading.Lock()  # while a device is commanded to light something
+        self._lighting = threading.Lock()  # during a command that may light something
         self._standstill: Standstill | None = None
 
     @classmethod
     def granted(cls, what: str) -> Self:
-        """A live one."""
+        """A live permission."""
         new = cls(what)
         new.grant()
         return new
@@ -51,19 +51,19 @@ class Permission:
         """Make it live. Raises `NotPermitted` where it was revoked."""
         with self._changing:
             if self._state == "revoked":
-                raise NotPermitted(f"{self._what} may light nothing any more: {self._why}")
+                raise NotPermitted(f"{self._what} has lost its permission to light: {self._why}")
             self._state = "live"
 
     def suspend(self, why: str) -> None:
-        """Let nothing be lit until `grant`."""
+        """Refuse light until `grant`."""
         self._leave(("live",), "suspended", why)
 
     def revoke(self, why: str) -> None:
-        """Let nothing be lit any more; the first reason counts."""
+        """Refuse light for good; the first reason is kept."""
         self._leave(("not granted", "live", "suspended"), "revoked", why)
 
     def lapse(self, why: str) -> None:
-        """Revoke it where it is live: a suspended one is granted anew by a person."""
+        """Revoke it if it is live; a suspended one needs a person's grant anyway."""
         self._leave(("live",), "revoked", why)
 
     @contextmanager
@@ -78,7 +78,7 @@ class Permission:
 
     @contextmanager
     def lapsing(self, limit_s: float) -> Iterator[None]:
-        """A context in which it lapses where this process stands still for longer."""
+        """A context in which it lapses when this process stands still for more than `limit_s`."""
         with Standstill(limit_s, self.lapse) as self._standstill:
             yield
 
@@ -94,8 +94,8 @@ class Permission:
 
     @contextmanager
     def no_light(self, within_s: float) -> Iterator[None]:
-        """A context in which no command that lights is under way; one that takes longer than
-        `within_s` seconds to end is not waited for. Revoke it first."""
+        """A context in which no lighting command is under way; waits at most `within_s` seconds for
+        one to end. Revoke the permission first."""
         held = self._lighting.acquire(timeout=max(0.0, within_s))
         try:
             yield
@@ -114,8 +114,8 @@ _thread = threading.local()
 
 @contextmanager
 def lighting(doing: str) -> Iterator[None]:
-    """A context for one command of the calling thread that may light something: what every driver
-    and wrapper enters that has such a command. Raises `NotPermitted`."""
+    """A context for one command of the calling thread that may light something. Every driver and
+    wrapper enters it for such commands. Raises `NotPermitted`."""
     permission: Permission | None = getattr(_thread, "permission", None)
     if permission is None:
         raise NotPermitted(f"{doing}: this thread has no permission to light anything")

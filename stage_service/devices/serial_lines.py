@@ -22,17 +22,17 @@ from stage_service.devices.serial_ports import ExclusivePort
 
 LONGEST_LINE = 4096
 MOST_LINES = 1000
-"""A device that has sent so many without its identity is another, however fast it goes on."""
+"""Lines without the expected identity after which the device counts as another one."""
 REFUSED_BY_SAFETY = 3
 WATCHDOG_S = (0.1, 60.0)
 _PLACES = {"n": r"(\d+)", "word": "([a-z-]+)", "text": "(.+)"}
-_ECHOES = "The line sends back what it gets: switch the adapter's local echo off."
+_ECHOES = "The line echoes the service's requests: switch the adapter's local echo off."
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What a kind of device answers to `ID?`: its first word, the whole as a pattern, and how an
-    error describes it."""
+    """A kind of device's reply to `ID?`: its first word, its pattern, and its description in
+    errors."""
 
     word: str
     pattern: re.Pattern[str]
@@ -42,9 +42,9 @@ class Identity:
 class SerialLines:
     """One request at a time, each with a deadline; safe to call from several threads.
 
-    After a missed deadline or a broken reply the port is closed; the next request opens it, drains
-    what came late and reads on until the device has identified itself, so no late reply answers a
-    later request. A request that comes back, and an empty line, are dropped: neither is a reply.
+    After a missed deadline or a broken reply the port is closed. The next request opens it, drops
+    late input and reads until the device has identified itself, so that a late reply is never taken
+    for a later one's. Echoed requests and empty lines are dropped.
     """
 
     def __init__(self, name: str, config: SerialConfig, identity: Identity) -> None:
@@ -55,7 +55,7 @@ class SerialLines:
         self._lock = threading.RLock()
 
     def connect(self) -> re.Match[str]:
-        """Open the port and return the match of the device's answer to `ID?`."""
+        """Open the port and return the match of the device's reply to `ID?`."""
         config = self.config
         with self._lock:
             self.close()
@@ -98,20 +98,20 @@ class SerialLines:
             if error is None:
                 self.close()  # the true reply may still be on its way
         if error is not None and int(error[1]) == REFUSED_BY_SAFETY:
-            expected = f"an answer to {request!r}"
+            expected = f"a reply to {request!r}"
             received = f"a refusal: {error[2] or line}"
             todo = "Close the interlock and release the emergency stop at the stage."
             raise self._error(SafetyRefusal, doing, expected, received, todo)
-        expected = f"an answer to {request!r} like {reply!r}"
+        expected = f"a reply to {request!r} like {reply!r}"
         todo = "Check that the device follows docs/reference/wire.md and has the port to itself."
         raise self._error(DeviceError, doing, expected, repr(line), todo)
 
     def echo(self, request: str, doing: str) -> None:
-        """`request` for what the device does and repeats."""
+        """`request` for commands that the device repeats in its reply."""
         self._exchange(request, re.escape(f"OK {request}"), f"OK {request}", doing)
 
     def set_watchdog(self, seconds: float) -> None:
-        """Set the device's watchdog; raises `ValueError` beyond what devices take."""
+        """Set the device's watchdog; raises `ValueError` outside 0.1 to 60 s."""
         low, high = WATCHDOG_S
         if not low <= seconds <= high:
             raise ValueError(
@@ -122,8 +122,8 @@ class SerialLines:
     def upload(
         self, words: tuple[str, str, str, str], texts: Sequence[str], most: int, steps: int
     ) -> None:
-        """Upload up to `most` texts and arm the device, which answers with our checksum and number
-        of steps. `words`: the requests for the whole and for one text, and their names."""
+        """Upload up to `most` texts and arm the device, whose reply must have our checksum and
+        number of steps. `words`: the requests for the whole and for one text, and their names."""
         begin, each, whole, parts = words
         if not 1 <= len(texts) <= most:
             doing, received = f"uploading a {whole}", f"{len(texts)} {parts}"
@@ -138,8 +138,8 @@ class SerialLines:
         self.request("ARM", f"OK ARM {steps} {crc:08x}", f"arming the {whole}")
 
     def _identify(self) -> re.Match[str]:
-        doing, seen = "identifying", ""
-        # "?" ends what a device may hold of a request that was cut off; the two make no request.
+        doing, found = "identifying", ""
+        # "?" ends a request that was cut off in the device's buffer.
         own = ("?", "ID?")
         self._send("\n".join(own), doing)
         deadline = time.monotonic() + self.config.timeout_s
@@ -147,27 +147,27 @@ class SerialLines:
             try:
                 line = self._line(deadline, doing)
             except DeviceTimeout:
-                if not seen:
+                if not found:
                     raise
                 break
             if match := self._identity.pattern.fullmatch(line):
                 return match
-            if line and (line not in own or seen in ("", *own)):
-                seen = line
+            if line and (line not in own or found in ("", *own)):
+                found = line
         self.close()
-        expected, todo = self._identity.shown, self._advice(seen, own)
-        raise self._error(DeviceError, doing, expected, repr(seen), todo)
+        expected, todo = self._identity.shown, self._advice(found, own)
+        raise self._error(DeviceError, doing, expected, repr(found), todo)
 
-    def _advice(self, seen: str, own: Sequence[str]) -> str:
-        """What to do about a device that has said this of itself."""
-        if seen in own:
-            return f"{_ECHOES} No device answers behind it: check its power and cable."
-        if seen.startswith(self._identity.word):
-            return "It is the right kind of device, with an identity that docs/wire.md excludes."
+    def _advice(self, found: str, own: Sequence[str]) -> str:
+        """What to do about a device with this identity."""
+        if found in own:
+            return f"{_ECHOES} No device replies behind it: check its power and cable."
+        if found.startswith(self._identity.word):
+            return "Its identity is not one of docs/reference/wire.md: update its firmware."
         return "This is another device: check the ports in the rig file."
 
     def _reply(self, request: str, deadline: float, doing: str) -> str:
-        """The first line that is neither empty, nor the request, nor an identity that came late."""
+        """The first line that is neither empty, nor an echo, nor a late identity."""
         echoed = False
         while True:
             try:
@@ -175,7 +175,7 @@ class SerialLines:
             except DeviceTimeout as error:
                 if not echoed:
                     raise
-                received = "the request alone, which comes back"
+                received = "only an echo of the request"
                 kind, todo = DeviceTimeout, f"{_ECHOES} Check the device's power and cable."
                 raise self._error(kind, doing, "a reply", received, todo) from error
             echo, echoed = line == request, echoed or line == request
@@ -190,7 +190,7 @@ class SerialLines:
             raise self._lost(doing, error) from error
 
     def _line(self, deadline: float, doing: str) -> str:
-        """The next line; garbage bytes are kept, visibly, for the error message."""
+        """The next line; bytes outside ASCII are escaped for the error message."""
         assert self._port is not None
         data = b""
         try:
@@ -221,7 +221,7 @@ class SerialLines:
 
 
 def _pattern(reply: str) -> str:
-    """A reply with places, as `SerialLines.request` has it, as a pattern."""
+    """The pattern of a reply with places, see `SerialLines.request`."""
     parts = re.split("<([^>]*)>", reply)
     return "".join(
         _PLACES.get(part, f"({part})") if number % 2 else re.escape(part)

@@ -12,11 +12,10 @@ _AGAIN_S = 0.02
 
 
 class ExclusivePort(serial.Serial):  # type: ignore[misc]  # pyserial has no types
-    """A port that nobody else may open, given up at `close`.
+    """A port locked by `flock(2)` until `close`.
 
-    `flock(2)`: the lock goes with the open file, which a child that the process forks shares until
-    it becomes another program. So it is released by name, and a port that is held is asked for
-    again for `write_timeout` seconds; then `serial.SerialException`.
+    A forked child shares the lock until it calls `exec`, so `close` unlocks explicitly and `open`
+    retries a locked port for `write_timeout` seconds before it raises `serial.SerialException`.
     """
 
     def __init__(

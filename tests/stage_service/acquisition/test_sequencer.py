@@ -115,7 +115,7 @@ def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world,
     records = Capture(tmp_path / "c").records
     taken_back = {step for (step, _), r in records.items() if r.file is None}
     assert taken_back == {2, 3, 4}  # armed alike, the pulse that fired twice among them
-    assert "another step's" in str(records[2, "cam_0"].reason)
+    assert "another step" in str(records[2, "cam_0"].reason)
     assert {step for step, _ in records} == {0, 1, 2, 3, 4}
 
     world.double = set()
@@ -211,8 +211,7 @@ def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, 
 
     run.devices.trigger.pulse = cut  # type: ignore[method-assign]
     assert run.run() == "failed"
-    told = "after the exposure of step 2 (light_003): expected 1 lamp lit, received 0 lit. The bank"
-    assert told in str(run.error)
+    assert "expected 1 lamp lit, received 0 lit" in str(run.error)
     assert max(step for step, _ in Capture(tmp_path / "c").records) == 1
 
 

@@ -121,7 +121,7 @@ def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, wor
             flood(http, "GET", "/devices")
             seen = http.get("/devices").json()
             assert seen["age_s"] is None
-            assert seen["cameras"]["cam_0"]["state"] == "not asked yet"
+            assert seen["cameras"]["cam_0"]["state"] == "not queried yet"
             world.lit = {3}
             assert_it_can_be_darkened(http, world, None)
 

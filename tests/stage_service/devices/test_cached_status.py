@@ -15,5 +15,5 @@ def test_who_found_no_thread_to_look_with_looks_the_next_time(monkeypatch):
     with monkeypatch.context() as full:
         full.setattr(threading.Thread, "start", none_left)
         assert seen.get() == {"free": None, "age_s": None}
-        assert seen.looking_s() == 0
+        assert seen.running_s() == 0
     assert seen.get()["free"] == 5
