@@ -66,7 +66,7 @@ def test_an_echo_alone_is_no_reply(serial_stage, word):
         "STOP": stage.trigger.stop,
         "STATUS?": stage.trigger.status,
     }
-    with pytest.raises(DeviceTimeout, match="received the request alone, which comes back"):
+    with pytest.raises(DeviceTimeout, match="received only an echo"):
         calls[word]()
     calls[word]()  # it identifies itself first, and the next reply is the next request's
     assert stage.trigger.count() == stage.wires.fired
@@ -114,7 +114,7 @@ def test_what_a_reply_has_to_be_is_told_without_a_pattern(serve):
     config = serve(lambda line: "HAIRSTAGE-TRIGGER 2 8" if line == "ID?" else "SEQ asleep")
     driver = SerialTriggerBox(config)
     driver.connect()
-    wanted = r"an answer to 'SEQ\?' like 'SEQ <idle\|armed\|running\|done\|stopped> <n> <n> <word>'"
+    wanted = r"a reply to 'SEQ\?' like 'SEQ <idle\|armed\|running\|done\|stopped> <n> <n> <word>'"
     with pytest.raises(DeviceError, match=wanted + " within .* received 'SEQ asleep'"):
         driver.progress()
     with pytest.raises(DeviceError, match="like 'COUNT <n>' within"):

@@ -15,7 +15,7 @@ LATE_S = 0.37  # after the driver's deadline, before that of the next request
 LONG = TableRow(1, "LP", 0.0, 9.0, 0.0)
 WIRE = {
     "silent": (DeviceTimeout, "expected a line within {timeout} s, received nothing"),
-    "garbage": (DeviceError, r"expected an answer to .* within {timeout} s, received '.\\x7f"),
+    "garbage": (DeviceError, r"expected a reply to .* within {timeout} s, received '.\\x7f"),
     "nak": (DeviceError, "received 'ERR 4 busy'"),
     "late": (DeviceTimeout, "expected a line within {timeout} s, received nothing"),
     "noise": (DeviceError, r"received '\\\\xff\\x00\\x1b\[A~~'"),

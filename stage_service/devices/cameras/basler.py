@@ -1,6 +1,6 @@
 """A Basler camera through pylon, triggered by wire; see `docs/reference/wire.md`.
 
-What a camera can do is asked of its node map, not of its model's name.
+A camera's features are read from its node map, never derived from the model's name.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from stage_service.devices.cameras.interface import CameraCapabilities, CameraIn
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 
 SLICE_S = 0.05
-"""How long a wait for a frame does not look at `cancel`."""
+"""Seconds between two checks of `cancel` while waiting for a frame."""
 BLOCK_WRAP = (1 << 63) - 1
-"""Block ids are handed on unwrapped."""
+"""Block ids are unwrapped here."""
 EXPOSURE_TOLERANCE = 0.01
-"""Cameras round exposures to their line time; beyond this they cannot expose as asked."""
+"""Largest relative error of an exposure; cameras round to their line time."""
 EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
 """Microseconds; the second on cameras older than SFNC 2."""
 QUIET: tuple[tuple[str, str | float | bool], ...] = (
@@ -37,7 +37,7 @@ QUIET: tuple[tuple[str, str | float | bool], ...] = (
     ("BalanceWhiteAuto", "Off"),
     ("Gamma", 1.0),
 )
-"""What would otherwise pace the camera by itself or bend its response; not every model has all."""
+"""Settings that would pace the camera or bend its response; not every model has all of them."""
 OURS = {
     *(name for name, _ in QUIET),
     *EXPOSURES,
@@ -45,7 +45,7 @@ OURS = {
     *("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerActivation", "TriggerOverlap"),
     *("TriggerDelay", "TriggerDelayAbs", "LineSelector", "LineMode"),
 }
-"""Nodes that the driver sets: not for `features`."""
+"""Nodes that the driver sets; `features` may not."""
 
 
 class BaslerCamera:
@@ -83,7 +83,7 @@ class BaslerCamera:
         """
         self.close()
         self._pylon, self._genicam = _pypylon(self.device)
-        with self._told("connecting"):
+        with self._as_device_error("connecting"):
             factory = self._pylon.TlFactory.GetInstance()
             there = {d.GetSerialNumber(): d for d in factory.EnumerateDevices()}
             if self.serial not in there:
@@ -106,12 +106,12 @@ class BaslerCamera:
         self._exposure = None
 
     def arm(self, exposure: float) -> None:
-        """Answer the next pulses with `exposure` seconds; returns when the camera waits for them.
+        """Expose at the next pulses for `exposure` seconds; returns once the camera waits for them.
 
-        Frames not read are dropped, but counted in the block ids once they reached the queue.
+        Unread frames are dropped, but counted in the block ids once they reached the queue.
         """
         doing = f"arming for {exposure:g} s"
-        with self._told(doing):
+        with self._as_device_error(doing):
             camera = self._open(doing)
             self._stop(camera)
             nodes = self._nodes()
@@ -133,15 +133,15 @@ class BaslerCamera:
         self._exposure = actual
 
     def disarm(self) -> None:
-        """Answer no more pulses; frames not read are dropped."""
-        with self._told("disarming"):
+        """Ignore pulses from now on; unread frames are dropped."""
+        with self._as_device_error("disarming"):
             self._stop(self._open("disarming"))
 
     def read(self, cancel: threading.Event) -> Frame | None:
-        """The oldest frame not read, or None: none within its exposure and `frame_s`, or one that
+        """The oldest unread frame; None where none came within its exposure and `frame_s`, or it
         was damaged on its way."""
         doing = "reading a frame"
-        with self._told(doing):
+        with self._as_device_error(doing):
             camera = self._open(doing)
             if self._exposure is None:
                 return None
@@ -165,9 +165,9 @@ class BaslerCamera:
         doing = "setting up"
         if ours := sorted(OURS & self.config.features.keys()):
             received = ", ".join(ours)
-            todo = "Take them out of [devices.cameras.features]."
+            todo = "Remove them from [devices.cameras.features]."
             raise self._error(doing, "features that the driver does not set itself", received, todo)
-        with self._told(doing):
+        with self._as_device_error(doing):
             camera, nodes, config = self._open(doing), self._nodes(), self.config
             nodes.write_if_there("UserSetSelector", "Default")
             nodes.execute_if_there("UserSetLoad")
@@ -228,7 +228,7 @@ class BaslerCamera:
             return None
         if block_id is None:
             received = f"{result.GetBlockID()}"
-            todo = "The camera does not number its frames: losses would go unseen."
+            todo = "The camera does not number its frames, so losses could not be detected."
             raise self._error(doing, f"a block id from {self._blocks.first}", received, todo)
         info, pixel_format = self.info, self.config.pixel_format
         kind = getattr(self._pylon, f"PixelType_{pixel_format}")
@@ -239,17 +239,17 @@ class BaslerCamera:
             todo = "Another program changed the camera's settings: close it and start again."
             raise self._error(doing, expected, received, todo)
         chunks = Nodes(self.device, result.GetChunkDataNodeMap(), self._genicam)
-        if (told := chunks.number("ChunkExposureTime")) is not None:
-            self._check_exposure(told * 1e-6, exposure, doing)
+        if (actual := chunks.number("ChunkExposureTime")) is not None:
+            self._check_exposure(actual * 1e-6, exposure, doing)
         ticks = result.GetTimeStamp()
         timestamp = ticks / self._ticks_per_s if self._ticks_per_s else 0.0
         counts = pixel_formats.rgb(result.GetArray(), pixel_format)
         return Frame(counts, block_id, timestamp, exposure)
 
-    def _check_exposure(self, actual: float, asked: float, doing: str) -> None:
-        if abs(actual - asked) > EXPOSURE_TOLERANCE * asked:
-            todo = "The camera cannot expose so: choose an exposure that it has."
-            raise self._error(doing, f"an exposure of {asked:g} s", f"{actual:g} s", todo)
+    def _check_exposure(self, actual: float, requested: float, doing: str) -> None:
+        if abs(actual - requested) > EXPOSURE_TOLERANCE * requested:
+            todo = "The camera cannot make this exposure: choose one that it offers."
+            raise self._error(doing, f"an exposure of {requested:g} s", f"{actual:g} s", todo)
 
     def _nodes(self) -> Nodes:
         return Nodes(self.device, self._camera.GetNodeMap(), self._genicam)
@@ -261,8 +261,8 @@ class BaslerCamera:
         return self._camera
 
     @contextmanager
-    def _told(self, doing: str) -> Iterator[None]:
-        """What pylon raises, as a `DeviceError`."""
+    def _as_device_error(self, doing: str) -> Iterator[None]:
+        """Turn pylon's exceptions into `DeviceError`."""
         try:
             yield
         except self._generic_exception() as error:
@@ -287,8 +287,8 @@ class BaslerCamera:
 class BlockCounter:
     """Counts frames from 1 by their block ids, across wraps and restarts.
 
-    Ids run from `first` to `last`, begin again at `first`, and also do so with every `restart`.
-    A gap of a whole round cannot be seen.
+    Ids run from `first` to `last`, then begin again at `first`, as after every `restart`. A gap of
+    a whole round is not detected.
     """
 
     def __init__(self, first: int, last: int) -> None:
@@ -301,7 +301,7 @@ class BlockCounter:
         self._before = self.first - 1
 
     def take(self, block_id: int) -> int | None:
-        """The frame's number; an id that comes twice has the same twice. None: not an id."""
+        """The frame's number, the same for a repeated id; None for a value that is no id."""
         if not self.first <= block_id <= self.last:
             return None
         self.count += (block_id - self._before) % (self.last - self.first + 1)
@@ -313,7 +313,7 @@ def _pypylon(device: str) -> tuple[Any, Any]:
     """The modules `pylon` and `genicam`, loaded when the first camera is connected."""
     try:
         with warnings.catch_warnings():
-            # Its generated types warn while they are made; made an error, that ends the process.
+            # Its generated types warn on import.
             warnings.simplefilter("ignore")
             from pypylon import genicam, pylon
     except ImportError as error:
@@ -324,7 +324,7 @@ def _pypylon(device: str) -> tuple[Any, Any]:
 
 
 def _block_ids(camera: Any, nodes: Nodes) -> tuple[int, int]:
-    """First and last block id: GigE Vision counts from 1 in 16 bits unless told otherwise."""
+    """First and last block id: GigE Vision counts from 1, in 16 bits unless extended."""
     if not camera.IsGigE():
         return 0, BLOCK_WRAP
     extended = {nodes.text(f"{by}GevGVSPExtendedIDMode") for by in ("", "Bsl")}

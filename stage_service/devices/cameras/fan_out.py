@@ -19,8 +19,8 @@ Work = queue.SimpleQueue[tuple[Callable[[CameraDevice], Any], Future[Any]] | Non
 class FanOut:
     """A thread per camera, for calls that wait on the network.
 
-    Not a `ThreadPoolExecutor`: that refuses work while the interpreter exits, which is when a
-    capture still has to be stopped in order.
+    Not a `ThreadPoolExecutor`: that refuses work while the interpreter exits, when a capture still
+    has to be stopped in order.
     """
 
     def __init__(self, cameras: Sequence[CameraDevice]) -> None:
@@ -33,25 +33,24 @@ class FanOut:
     def __call__(
         self, call: Callable[[CameraDevice], T], waiting: Callable[[], object] | None = None
     ) -> dict[str, T]:
-        """`call(camera)` for every camera, by name, when all are done.
+        """`call(camera)` of every camera, by name; calls `waiting()` every `LOOK_S` seconds until
+        all are done.
 
-        Until then `waiting()` is called every `LOOK_S` seconds.
-
-        Raises the error of the only camera that failed, or an `ExceptionGroup` of all that did;
-        `Cancelled` only where nothing else went wrong.
+        Raises the error of the only camera that failed, or an `ExceptionGroup` of several;
+        `Cancelled` only where there is no other error.
         """
-        answers: list[Future[T]] = [Future() for _ in self.cameras]
-        for work, answer in zip(self._work, answers, strict=True):
-            work.put((call, answer))
-        while waiting is not None and wait(answers, LOOK_S).not_done:
+        results: list[Future[T]] = [Future() for _ in self.cameras]
+        for work, result in zip(self._work, results, strict=True):
+            work.put((call, result))
+        while waiting is not None and wait(results, LOOK_S).not_done:
             waiting()
-        errors = [e for a in answers if isinstance(e := a.exception(), Exception)]
+        errors = [e for r in results if isinstance(e := r.exception(), Exception)]
         errors = [e for e in errors if not isinstance(e, Cancelled)] or errors[:1]
         if len(errors) == 1:
             raise errors[0]
         if errors:
             raise ExceptionGroup("; ".join(str(e) for e in errors), errors)
-        return {c.name: a.result() for c, a in zip(self.cameras, answers, strict=True)}
+        return {c.name: r.result() for c, r in zip(self.cameras, results, strict=True)}
 
     def close(self) -> None:
         """Let the threads end."""
@@ -61,8 +60,8 @@ class FanOut:
 
 def _serve(camera: CameraDevice, work: Work) -> None:
     while (item := work.get()) is not None:
-        call, answer = item
+        call, result = item
         try:
-            answer.set_result(call(camera))
-        except Exception as error:  # handed to the caller
-            answer.set_exception(error)
+            result.set_result(call(camera))
+        except Exception as error:  # raised in the caller
+            result.set_exception(error)

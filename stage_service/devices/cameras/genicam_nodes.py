@@ -1,4 +1,4 @@
-"""A GenICam node map: settings by name, where the camera has them, with errors that can be read."""
+"""A GenICam node map: settings by name, where the camera has them, with errors as sentences."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Nodes:
         return tuple(self._nodes.GetNode(name).GetSettableValues()) if self.has(name) else ()
 
     def number(self, name: str) -> float | None:
-        """A node's value, or None where the camera lacks it or will not tell."""
+        """A node's value, or None where the camera lacks it or it is not readable."""
         node = self._nodes.GetNode(name)
         return node.GetValue() if self._genicam.IsReadable(node) else None
 
@@ -37,7 +37,7 @@ class Nodes:
         return node.ToString() if self._genicam.IsReadable(node) else None
 
     def write_if_there(self, name: str, value: Value) -> None:
-        """As `write`, but a camera that lacks the node is left alone."""
+        """As `write`, where the camera has the node."""
         if self.has(name):
             self.write(name, value)
 

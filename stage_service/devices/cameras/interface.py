@@ -1,4 +1,4 @@
-"""What the sequencer asks of a camera."""
+"""The interface of a camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reconstruction.arrays import Floats
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera's answer to hello: `gain` is counts per (W/(sr m²) · s), `black` in counts."""
+    """A camera's description: `gain` in counts per (W/(sr m²) · s), `black` in counts."""
 
     width: int
     height: int
@@ -57,10 +57,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class CameraCapabilities:
-    """What camera and link can do.
+    """Abilities of camera and link.
 
-    `buffers`: frames that it holds unread. `timestamps`: its clock tells frames apart.
-    `block_wrap`: the last block id before they begin again at 1.
+    `buffers`: unread frames that it can hold. `timestamps`: it stamps frames with its clock.
+    `block_wrap`: the last block id; the next is 1.
     """
 
     buffers: int
@@ -76,7 +76,7 @@ class CameraDevice(Protocol):
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera said of itself; known after `connect`."""
+        """The camera's description; known after `connect`."""
 
     def connect(self) -> None:
         """Open the link and check that the camera is the rig file's."""
@@ -85,13 +85,13 @@ class CameraDevice(Protocol):
         """Close the link."""
 
     def arm(self, exposure: float) -> None:
-        """Answer the next pulses with `exposure` seconds; frames not read are dropped."""
+        """Expose at the next pulses for `exposure` seconds; unread frames are dropped."""
 
     def disarm(self) -> None:
-        """Answer no more pulses."""
+        """Ignore pulses from now on."""
 
     def read(self, cancel: threading.Event) -> Frame | None:
-        """The oldest frame not read, or None when no pulse reached the camera.
+        """The oldest unread frame, or None when no pulse reached the camera.
 
-        Waits while the camera is busy. Raises `Cancelled` when `cancel` is set meanwhile.
+        Waits while the camera is busy. Raises `Cancelled` once `cancel` is set.
         """

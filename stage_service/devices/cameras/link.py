@@ -21,7 +21,7 @@ BLOCK_WRAP = 65535
 LONGEST_HEADER = 1 << 20
 LONGEST_PAYLOAD = 1 << 30
 POLL_S = (0.001, 0.05)
-"""A busy camera is asked again after the first, doubling up to the second."""
+"""Wait before a busy camera is read again: the first, doubled up to the second."""
 
 
 class LinkCamera:
@@ -58,9 +58,9 @@ class LinkCamera:
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         doing = "saying hello"
-        answer, _ = self._ask({"op": "hello", "camera": self.name}, doing)
-        whole = (int(self._number(answer, f, doing)) for f in ("width", "height", "full_scale"))
-        info = CameraInfo(*whole, *(self._number(answer, f, doing) for f in ("black", "gain")))
+        reply, _ = self._request({"op": "hello", "camera": self.name}, doing)
+        whole = (int(self._number(reply, f, doing)) for f in ("width", "height", "full_scale"))
+        info = CameraInfo(*whole, *(self._number(reply, f, doing) for f in ("black", "gain")))
         size = (self.geometry.width, self.geometry.height)
         if (info.width, info.height) != size:
             expected = f"{size[0]}x{size[1]} pixels as in the rig file"
@@ -80,11 +80,11 @@ class LinkCamera:
         self._armed = None
 
     def arm(self, exposure: float) -> None:
-        self._ask({"op": "arm", "exposure": exposure}, f"arming for {exposure:g} s")
+        self._request({"op": "arm", "exposure": exposure}, f"arming for {exposure:g} s")
         self._armed = exposure
 
     def disarm(self) -> None:
-        self._ask({"op": "disarm"}, "disarming")
+        self._request({"op": "disarm"}, "disarming")
         self._armed = None
 
     def read(self, cancel: threading.Event) -> Frame | None:
@@ -93,10 +93,10 @@ class LinkCamera:
         deadline = time.monotonic() + busy_s
         wait = POLL_S[0]
         while True:
-            answer, payload = self._ask({"op": "read"}, doing)
-            status = answer.get("status")
+            reply, payload = self._request({"op": "read"}, doing)
+            status = reply.get("status")
             if status == "frame":
-                return self._frame(answer, payload, doing)
+                return self._frame(reply, payload, doing)
             if status == "empty":
                 return None
             if status != "busy":
@@ -110,32 +110,32 @@ class LinkCamera:
                 raise Cancelled(f"{self.device}: {doing} was given up")
             wait = min(2 * wait, POLL_S[1])
 
-    def _frame(self, answer: dict[str, Any], payload: bytes, doing: str) -> Frame:
+    def _frame(self, reply: dict[str, Any], payload: bytes, doing: str) -> Frame:
         info = self.info
         expected = info.width * info.height * 3 * 2
         if len(payload) != expected:
             todo = "Check the camera's pixel format: RGB, 16 bits, little-endian."
             raise self._error(doing, f"{expected} bytes of counts", f"{len(payload)}", todo)
-        exposure = self._number(answer, "exposure", doing)
+        exposure = self._number(reply, "exposure", doing)
         if self._armed is None or abs(exposure - self._armed) > 1e-3 * self._armed:
             received = f"{exposure} s"
             todo = "A frame from before arming was in the queue, or the camera cannot expose so."
             raise self._error(doing, f"an exposure of {self._armed} s as armed", received, todo)
         counts = np.frombuffer(payload, "<u2").reshape(info.height, info.width, 3)
-        block_id, timestamp = (self._number(answer, f, doing) for f in ("block_id", "timestamp"))
-        left = int(self._number({"left": 0, **answer}, "left", doing))
+        block_id, timestamp = (self._number(reply, f, doing) for f in ("block_id", "timestamp"))
+        left = int(self._number({"left": 0, **reply}, "left", doing))
         counts = counts.astype(np.uint16, copy=False)
         return Frame(counts, int(block_id), timestamp, exposure, left)
 
-    def _number(self, answer: dict[str, Any], field: str, doing: str) -> Any:
-        value = answer.get(field)
+    def _number(self, reply: dict[str, Any], field: str, doing: str) -> Any:
+        value = reply.get(field)
         if not isinstance(value, int | float) or isinstance(value, bool):
             todo = "Check that the camera follows docs/reference/wire.md."
             raise self._error(doing, f"a number {field!r}", repr(value), todo)
         return value
 
-    def _ask(self, request: dict[str, Any], doing: str) -> tuple[dict[str, Any], bytes]:
-        """One request, one answer, within `timeout_s`; on trouble the connection is closed."""
+    def _request(self, request: dict[str, Any], doing: str) -> tuple[dict[str, Any], bytes]:
+        """One request, one reply, within `timeout_s`; a failure closes the connection."""
         with self._lock:
             if self._socket is None:
                 received = "a closed one"
@@ -150,8 +150,8 @@ class LinkCamera:
                 (length,) = struct.unpack(">I", self._receive(4, deadline))
                 if length > LONGEST_HEADER:
                     raise ValueError(f"a message of {length} bytes")
-                answer = parse_json(self._receive(length, deadline))
-                length = int(answer.get("bytes", 0))
+                reply = parse_json(self._receive(length, deadline))
+                length = int(reply.get("bytes", 0))
                 if not 0 <= length <= LONGEST_PAYLOAD:
                     raise ValueError(f"a payload of {length} bytes")
                 payload = self._receive(length, deadline)
@@ -161,17 +161,17 @@ class LinkCamera:
                 kind = DeviceTimeout if late else DeviceUnreachable
                 came = "nothing, or not all of it" if late else str(error) or "a closed connection"
                 todo = "Check the camera's power and network, and start again."
-                raise kind(self.device, doing, "an answer", came, todo, timeout_s) from error
+                raise kind(self.device, doing, "a reply", came, todo, timeout_s) from error
             except (ValueError, AttributeError, TypeError) as error:
                 self.close()
                 todo = "Check the port in [devices.cameras]: this is another device."
                 raise self._error(doing, "length-prefixed JSON", str(error), todo) from error
-        if answer.get("ok") is not True:
-            if answer.get("ok") is not False:  # no answer at all: the true one may still come
+        if reply.get("ok") is not True:
+            if reply.get("ok") is not False:  # not a reply: the true one may still come
                 self.close()
             todo = "Check that the rig file is this stage's."
-            raise self._error(doing, "ok", f"{answer.get('error', answer)}", todo)
-        return answer, payload
+            raise self._error(doing, "ok", f"{reply.get('error', reply)}", todo)
+        return reply, payload
 
     def _receive(self, count: int, deadline: float) -> bytes:
         assert self._socket is not None

@@ -14,8 +14,7 @@ DEMOSAIC = {
     "GB": cv2.COLOR_BayerGBRG2RGB,
     "BG": cv2.COLOR_BayerBGGR2RGB,
 }
-"""OpenCV's bilinear ones: linear in the counts, so that frames of single lights still add up to the
-frame of all lights, which edge-aware ones do not keep."""
+"""Bilinear, so linear in the counts: frames of single lights add up to that of all lights."""
 
 
 def full_scale(pixel_format: str) -> int:

@@ -1,11 +1,11 @@
 """A light bank on DMX through an Enttec DMX USB Pro (its API specification 1.44).
 
-The widget repeats the newest frame by itself: it is no dead-man, and nothing comes back from the
-lamps. After each frame it is asked for its parameters: the answer says that the frame has reached
-the widget, and how long it takes until it is out, which every command waits for. No other request
-is ever sent, as the widget stops its output for it. An answer is known by its bytes of user
-configuration, another number for each request; widgets of other makers ignore the number, and what
-comes late from them is waited for and dropped.
+The widget repeats the newest frame by itself, so there is no dead-man and no read-back. After each
+frame the driver requests the widget's parameters: the reply confirms the frame and has the frame
+rate, so that every command can wait until its frame is out. No other request is sent, because the
+widget stops its output for it. A reply is matched by its number of bytes of user configuration,
+which changes with each request; other makers' widgets ignore that number, so their late replies are
+waited for and dropped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
 _MOST_USER_DATA = 32
 _MOST_QUIET = 4
-"""Time-outs, within which a widget that an answer is missing of must be silent for one."""
+"""Time-outs within which a widget with a missing reply must be silent for one time-out."""
 _STILL_LIT = "Its lamps may still be lit."
 SLOWEST_FRAME_S = 0.023
 """A frame of 512 channels at full speed (ANSI E1.11)."""
@@ -39,8 +39,8 @@ _PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frame
 class DmxLightBank:
     """Implements `LightBank` without read-back, dead-man and table; see there for the contract.
 
-    Levels have 8 bits: they are rounded to n / 255, and a level above 0 that would become 0 is an
-    error. Raises `RigError` where the lamps do not fit one universe.
+    Levels are rounded to n / 255; a level above 0 that would become 0 is an error. Raises
+    `RigError` where the lamps do not fit one universe.
     """
 
     capabilities = LightCapabilities(reads_back=False, dead_man=False, table=0)
@@ -57,24 +57,24 @@ class DmxLightBank:
         self.count = lamps
         self._level = 1.0
         self._on: range = range(0)
-        self._asked = 0  # bytes of user configuration, by the newest request
-        self._bare = False  # whether the widget answers without any
-        self._late = False  # whether an answer is missing
+        self._user_bytes = 0  # bytes of user configuration in the newest request
+        self._bare = False  # whether the widget replies without any
+        self._late = False  # whether a reply is missing
         self._sent = b""  # since the port was last read empty
         self._port: ExclusivePort | None = None
         self._lock = threading.RLock()
 
     def connect(self) -> None:
-        """Open the port and check that a widget answers; `DeviceError` unless the rig file accepts
+        """Open the port and check that a widget replies; `DeviceError` unless the rig file accepts
         that a blackout cannot be verified."""
         accepted = self.config.accept_unverified_blackout
         limits.refuse_unverified_blackout(self.name, self.capabilities, accepted)
         with self._lock:
             self._open()
-            self._ask_parameters("identifying")
+            self._request_parameters("identifying")
 
     def close(self) -> None:
-        """Close the port; the widget goes on with its last frame."""
+        """Close the port; the widget keeps repeating its last frame."""
         with self._lock:
             if self._port is not None:
                 self._port.close()
@@ -92,7 +92,7 @@ class DmxLightBank:
         self._show(range(0), self._level, "putting all lamps off")
 
     def set_level(self, level: float) -> None:
-        """Set the level of the lamps that are on, and of those that come next."""
+        """Set the level of the lamps that are on, and of the next ones."""
         doing = f"setting the level to {level:g}"
         limits.level_word(self.name, doing, level, self.config.level_steps())
         with self._lock:
@@ -127,13 +127,13 @@ class DmxLightBank:
         with self._lock:
             self._open()
             self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)
-            rate = self._ask_parameters(doing)
+            rate = self._request_parameters(doing)
             self._on = on
             # The frame that is on the wire ends first, then ours is sent.
             time.sleep(2 / rate if rate else 2 * SLOWEST_FRAME_S)
 
     def _open(self) -> None:
-        """Have an open port; what came before is dropped."""
+        """Open the port if needed; earlier input is dropped."""
         try:
             if self._port is None:
                 # The widget's USB driver ignores the baud rate.
@@ -152,15 +152,15 @@ class DmxLightBank:
         except OSError as error:
             raise self._lost(doing, error) from error
 
-    def _ask_parameters(self, doing: str) -> int:
-        """Wait until the widget has taken all that was sent to it; returns its frames a second, 0
-        for as many as it can."""
+    def _request_parameters(self, doing: str) -> int:
+        """Wait until the widget has taken everything sent; returns its frames per second, 0 for
+        the fastest."""
         assert self._port is not None
         if self._late and self._bare:
             self._drain(doing)
-        self._asked = self._asked % _MOST_USER_DATA + 1
+        self._user_bytes = self._user_bytes % _MOST_USER_DATA + 1
         self._late = True
-        self._send(GET_PARAMETERS, struct.pack("<H", self._asked), doing)
+        self._send(GET_PARAMETERS, struct.pack("<H", self._user_bytes), doing)
         timeout_s = self.config.timeout_s
         deadline = time.monotonic() + timeout_s
         came = b""
@@ -172,8 +172,8 @@ class DmxLightBank:
                     got = came[:32].hex(" ") or "nothing"
                     todo = f"{_STILL_LIT} Check its USB cable, and that it is an Enttec USB Pro."
                     if came and self._sent.endswith(came):
-                        got = "what was sent, which comes back"
-                        todo = f"{_STILL_LIT} What is at this port only echoes: check the port."
+                        got = "an echo of the request"
+                        todo = f"{_STILL_LIT} The device at this port only echoes: check the port."
                     raise DeviceTimeout(self.name, doing, "its parameters", got, todo, timeout_s)
                 came += self._port.read(max(1, self._port.in_waiting))
         except OSError as error:
@@ -182,15 +182,15 @@ class DmxLightBank:
         return rate
 
     def _frames_per_second(self, data: bytes) -> int | None:
-        """What the answer to the newest request says, where it is in `data`."""
-        for user_data, rate in _answers(data):
-            if user_data in (0, self._asked):
+        """The rate in the reply to the newest request, where `data` holds it."""
+        for user_data, rate in _replies(data):
+            if user_data in (0, self._user_bytes):
                 self._bare = user_data == 0
                 return rate
         return None
 
     def _drain(self, doing: str) -> None:
-        """Drop what comes until nothing has come for as long as an answer may take."""
+        """Drop input until the widget has been silent for one time-out."""
         assert self._port is not None
         quiet = self.config.timeout_s
         deadline = time.monotonic() + _MOST_QUIET * quiet
@@ -200,7 +200,7 @@ class DmxLightBank:
                 if time.monotonic() > deadline:
                     self.close()
                     got, most = came[:32].hex(" "), _MOST_QUIET * quiet
-                    todo = f"{_STILL_LIT} Take it off other DMX lines: it passes on what it hears."
+                    todo = f"{_STILL_LIT} Disconnect its DMX input: it forwards what it receives."
                     raise DeviceTimeout(self.name, doing, "a moment's silence", got, todo, most)
         except OSError as error:
             raise self._lost(doing, error) from error
@@ -212,9 +212,9 @@ class DmxLightBank:
         return DeviceUnreachable(self.name, doing, expected, str(error), todo, timeout_s)
 
 
-def _answers(data: bytes) -> Iterator[tuple[int, int]]:
-    """Bytes of user configuration and frames a second, of each whole answer to `GET_PARAMETERS` in
-    `data`, among whatever else came."""
+def _replies(data: bytes) -> Iterator[tuple[int, int]]:
+    """Bytes of user configuration and frames per second of each complete reply to `GET_PARAMETERS`
+    in `data`."""
     for start in range(len(data) - 4):
         first, label, size = struct.unpack_from("<BBH", data, start)
         end = start + 4 + size

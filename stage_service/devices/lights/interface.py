@@ -1,4 +1,4 @@
-"""What the sequencer asks of a light bank."""
+"""The interface of a light bank."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 Lit = int | Literal["all", "none"]
-"""What an entry of a sequence puts on: one lamp by number, every lamp, or none."""
+"""What an entry of a sequence lights: one lamp by number, every lamp, or none."""
 
 
 @dataclass(frozen=True)
 class LightCapabilities:
-    """What link and device can do.
+    """Abilities of link and device.
 
     `reads_back`: a blackout can be verified. `dead_man`: the lamps go off by themselves when
-    heartbeats stop. `table`: entries of its sequence table; 0 where it has none. `owned`: it keeps
-    who has it.
+    heartbeats stop. `table`: entries of its sequence table, 0 without one. `owned`: it has an owner
+    register.
     """
 
     reads_back: bool
@@ -27,7 +27,7 @@ class LightCapabilities:
 
 @dataclass(frozen=True)
 class LightStatus:
-    """What the bank reports of itself; `lit` counts the lamps that are on."""
+    """The bank's status; `lit` counts the lamps that are on."""
 
     watchdog_tripped: bool
     interlock_open: bool
@@ -36,7 +36,7 @@ class LightStatus:
 
     @property
     def causes(self) -> str:
-        """Which of the three puts lamps off now, in words that follow a count; often none."""
+        """Which of the three keeps lamps off now, as a suffix of a sentence; often empty."""
         return (
             ", its watchdog has tripped" * self.watchdog_tripped
             + ", the interlock is open" * self.interlock_open
@@ -45,11 +45,11 @@ class LightStatus:
 
 
 CONTRADICTED = "reported lamps as off that were commanded on"
-"""By a read-back without a cause, which leaves its "dark" in doubt; the console looks for this."""
+"""Puts the bank's read-back of "dark" in doubt; the console searches for this text."""
 
 
 def lamps_lit(count: int) -> str:
-    """A number of lamps, as errors have it."""
+    """A number of lit lamps, for errors."""
     return f"{count} lamp{'' if count == 1 else 's'} lit"
 
 
@@ -58,14 +58,14 @@ def mismatch_todo(expected: int, status: LightStatus) -> str:
     if status.causes:
         return "Clear the cause at the stage."
     if status.lit < expected:
-        return f"The bank {CONTRADICTED}: look at them, and check their drivers' supply."
-    return "Check the lamp drivers, and that nobody else writes to the bank."
+        return f"The bank {CONTRADICTED}: look at the lamps, and check their drivers' supply."
+    return "Check the lamp drivers, and that no other program writes to the bank."
 
 
 class LightBank(Protocol):
     """Lamps `0 … count - 1` in the order of the rig. Safe to call from several threads.
 
-    Every call raises `DeviceError`; what the capabilities exclude raises it, too.
+    Every call raises `DeviceError`, also where the capabilities exclude it.
     """
 
     name: str
@@ -76,7 +76,7 @@ class LightBank(Protocol):
         """Number of lamps, as the rig file has it and `connect` has confirmed it."""
 
     def connect(self) -> None:
-        """Open the link and check that the right device answers."""
+        """Open the link and check the device's identity."""
 
     def close(self) -> None:
         """Close the link; the lamps stay as they are."""
@@ -91,18 +91,18 @@ class LightBank(Protocol):
         """Put every lamp off and leave a sequence; confirm it where the link can."""
 
     def set_level(self, level: float) -> None:
-        """Set the level of every lamp, 0 to 1; does nothing where it is set already."""
+        """Set the level of every lamp, 0 to 1; does nothing if it is set already."""
 
     def set_watchdog(self, seconds: float) -> None:
         """Set after how long without a heartbeat the lamps go off."""
 
     def heartbeat(self) -> None:
-        """Tell the watchdog that somebody is there."""
+        """Feed the watchdog."""
 
     def claim(self, number: int, name: str) -> str | None:
-        """Have the bank for the service `number`, 1 to 65535, until that is written over by 0.
+        """Take the bank for the service `number`, 1 to 65535; 0 releases it.
 
-        Returns None, or the name that another service gave, which goes on having it.
+        Returns None, or the name of the other service that has the bank and keeps it.
         """
 
     def status(self) -> LightStatus:

@@ -1,4 +1,4 @@
-"""A light bank that keeps the rig file's `[safety]` limits, whatever it is asked to do."""
+"""A light bank that enforces the rig file's `[safety]` limits."""
 
 from __future__ import annotations
 
@@ -18,22 +18,18 @@ from stage_service.devices.lights.interface import (
 )
 from stage_service.devices.permission import lighting
 
-LitTimes = dict[int, deque[tuple[float, float]]]
-"""By lamp, from when until when it was lit; kept beyond a connection, or duty would begin anew."""
-
 AGAIN_S = 0.1
-"""After so many seconds lamps that could not be put off are tried again."""
+"""Seconds until lamps that could not be put off are tried again."""
 
 
 class LimitedLightBank:
-    """Implements `LightBank` over `bank`; what exceeds `limits` raises `SafetyRefusal`, and what
-    may light a lamp `NotPermitted` where the calling thread uses no live permission.
+    """Implements `LightBank` over `bank`. A command beyond `limits` raises `SafetyRefusal`; one
+    that may light a lamp raises `NotPermitted` without a live permission of the calling thread.
 
-    A lamp that stays lit too long, or too much of the time, is put off by a thread of this bank.
-    From then on every command but `off` raises, heartbeats too, so that a bank that does not obey
-    is left to its own watchdog; `connect` begins anew. Sequences that the trigger box clocks are
-    checked entry by entry, before any is lit. `past` has how long lamps were lit before, and goes
-    on being kept. `lights` are the lamps' names in the rig, for errors.
+    A thread of this bank puts off a lamp that is lit for too long, or for too large a share of the
+    time. From then on every command but `off` raises, heartbeats too, so that the watchdog of a
+    bank that ignores `off` acts; `connect` resets this. Hardware-stepped sequences are checked
+    entry by entry before any lamp is lit. `lights` are the lamps' names in the rig, for errors.
     """
 
     def __init__(
@@ -41,17 +37,17 @@ class LimitedLightBank:
         bank: LightBank,
         limits: SafetyLimits,
         clock: Callable[[], float] = time.monotonic,
-        past: LitTimes | None = None,
         lights: Sequence[str] = (),
     ) -> None:
         self.name, self.capabilities = bank.name, bank.capabilities
         self._bank, self._limits, self._clock = bank, limits, clock
         self._lights = lights
         self.contradicted = False
-        """Whether the bank `CONTRADICTED`, and has confirmed no lit lamp since."""
-        self._level = 1.0  # what a bank has at power-up, and one without levels always
+        """Whether the bank `CONTRADICTED` a command and has confirmed no lit lamp since."""
+        self._level = 1.0  # a bank's level at power-up
         self._since: dict[int, float] = {}
-        self._past: LitTimes = {} if past is None else past
+        # By lamp, spans in which it was lit; kept across connections, for its duty.
+        self._past: dict[int, deque[tuple[float, float]]] = {}
         self._refusal: SafetyRefusal | None = None
         self._changed = threading.Condition(threading.RLock())
         self._wakes = 0.0
@@ -62,13 +58,13 @@ class LimitedLightBank:
         return self._bank.count
 
     def connect(self) -> None:
-        """Open the link; what was refused before is over."""
+        """Open the link and forget an earlier refusal."""
         self._bank.connect()
         with self._changed:
             self._refusal = None
 
     def close(self) -> None:
-        """Close the link; the lamps stay as they are, and are watched no more."""
+        """Close the link; the lamps stay as they are and are no longer watched."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._changed.notify_all()
@@ -98,7 +94,7 @@ class LimitedLightBank:
             except DeviceError as error:
                 raise self._naming_the_lit(error) from error
             self._lit(())
-            self._forget_what_did_not_come()
+            self._cut_future_spans()
 
     def set_level(self, level: float) -> None:
         doing = f"setting the level to {level:g}"
@@ -115,12 +111,12 @@ class LimitedLightBank:
         return self._bank.claim(number, name)
 
     def heartbeat(self) -> None:
-        """Tell the watchdog that somebody is there, unless lamps had to be put off."""
+        """Feed the watchdog, unless lamps had to be put off."""
         self._raise_refusal()
         self._bank.heartbeat()
 
     def status(self) -> LightStatus:
-        """Read the status back; says why, where lamps are off that were put on."""
+        """Read the status back; raises the refusal for which lit lamps were put off."""
         if self._since:
             self._raise_refusal()
         return self._bank.status()
@@ -128,8 +124,8 @@ class LimitedLightBank:
     def load_sequence(
         self, entries: Sequence[tuple[Lit, float]], times: Sequence[tuple[float, float]] = ()
     ) -> None:
-        """Check each entry and upload them. `times`: from when until when each is to be lit, in
-        seconds from now; it counts as lit then, unless `off` comes before."""
+        """Check each entry and upload them. `times`: the span in which each is lit, in seconds from
+        now; it counts for the duty unless `off` comes before."""
         with lighting("arming a sequence of lamps"), self._changed:
             self._raise_refusal()
             now, spans = self._clock(), []
@@ -149,7 +145,7 @@ class LimitedLightBank:
         return self._bank.position()
 
     def enforce(self) -> float:
-        """Put the lamps off where one has been lit too long; seconds until this is due again."""
+        """Put the lamps off if one has been lit too long; returns seconds until the next check."""
         with self._changed:
             if not self._since:
                 return self._limits.max_on_s
@@ -161,12 +157,12 @@ class LimitedLightBank:
                 self._refusal = self._too_long(lamp, now, f"keeping lamp {lamp} lit")
             try:
                 self._bank.off()
-            except Exception:  # the heartbeats have ended: the bank's own watchdog is at work, too
+            except Exception:  # no heartbeats any more: the bank's own watchdog acts, too
                 return AGAIN_S
             return self._limits.max_on_s
 
     def _allow(self, lamps: Sequence[int], doing: str) -> None:
-        """Take it that these lamps are lit from now on. Raises `SafetyRefusal`."""
+        """Count these lamps as lit from now on. Raises `SafetyRefusal`."""
         self._raise_refusal()
         self._check_lamps(len(lamps), doing)
         self._check_power(len(lamps), self._level, doing)
@@ -185,7 +181,7 @@ class LimitedLightBank:
             self._changed.notify_all()
 
     def _lit(self, lamps: Iterable[int]) -> None:
-        """Book the lamps that are lit from now on, and those that no longer are."""
+        """Set which lamps are lit from now on, and record the spans of the others."""
         now, before = self._clock(), self._since
         self._since = {x: before.get(x, now) for x in lamps}
         if self._limits.max_duty < 1:
@@ -193,8 +189,8 @@ class LimitedLightBank:
                 self._past.setdefault(lamp, deque()).append((before[lamp], now))
 
     def _book(self, spans: Iterable[tuple[int, str, tuple[float, float]]], now: float) -> None:
-        """Book what lamps are to be lit. Raises `SafetyRefusal`; then nothing is, and the bank's
-        sequence is left."""
+        """Record the spans in which lamps will be lit. Raises `SafetyRefusal` after leaving the
+        bank's sequence."""
         for lamp, doing, (begin, end) in spans:
             self._past.setdefault(lamp, deque()).append((now + begin, now + end))
             used = self._used(lamp, now + end)
@@ -202,7 +198,7 @@ class LimitedLightBank:
                 self.off()
                 raise self._too_much(doing, used)
 
-    def _forget_what_did_not_come(self) -> None:
+    def _cut_future_spans(self) -> None:
         now = self._clock()
         for past in self._past.values():
             while past and past[-1][1] > now:
@@ -211,7 +207,7 @@ class LimitedLightBank:
                     past.append((begin, now))
 
     def _left(self, lamp: int, now: float) -> float:
-        """Seconds that a lit lamp may at least stay lit."""
+        """Seconds that a lamp may stay lit from `now`."""
         limits = self._limits
         left = self._since.get(lamp, now) + limits.max_on_s - now
         if limits.max_duty < 1:
@@ -219,7 +215,7 @@ class LimitedLightBank:
         return left
 
     def _used(self, lamp: int, at: float) -> float:
-        """Seconds that the lamp is lit within the window that ends `at`, now or later."""
+        """Seconds that the lamp is lit within the duty window that ends `at`."""
         window, past = self._limits.duty_window_s, self._past.get(lamp, deque())
         while past and past[0][1] <= self._clock() - window:
             past.popleft()
@@ -230,7 +226,7 @@ class LimitedLightBank:
         limits, on = self._limits, now - self._since.get(lamp, now)
         if on >= limits.max_on_s:
             expected = f"at most {limits.max_on_s:g} s (max_on_s in [safety])"
-            todo = "It was put off. Shorten the exposure; a device that answers late keeps it lit."
+            todo = "It was put off. Shorten the exposure; a slow device also keeps a lamp lit."
             return self._error(doing, expected, f"lit for {on:.3g} s", todo)
         return self._too_much(doing, self._used(lamp, now))
 
@@ -246,7 +242,7 @@ class LimitedLightBank:
         if most is not None and lamps > most:
             expected = f"at most {most} lamps lit (max_lamps in [safety])"
             todo = "Leave the sentinels out of the plan (sentinels = false)."
-            raise self._error(doing, expected, f"{lamps} asked for", todo)
+            raise self._error(doing, expected, f"{lamps} requested", todo)
 
     def _check_power(self, lamps: int, level: float, doing: str) -> None:
         most, power = self._limits.max_power_w, lamps * level * self._limits.lamp_power_w
@@ -262,7 +258,7 @@ class LimitedLightBank:
 
     @contextmanager
     def _confirming(self) -> Iterator[None]:
-        """Whether the bank confirms that it lights what it is commanded to."""
+        """Track whether the bank confirms the lamps that it is commanded to light."""
         try:
             yield
         except DeviceError as error:
@@ -277,11 +273,11 @@ class LimitedLightBank:
         name = self._lights[lamp] if lamp < len(self._lights) else f"lamp {lamp}"
         last = f"{name} was" if len(self._since) == 1 else f"{len(self._since)} lamps were"
         received = f"{error.received} ({last} lit last)"
-        told = error.device, error.operation, error.expected, received, error.todo
-        return type(error)(*told, deadline_s=error.deadline_s)
+        fields = error.device, error.operation, error.expected, received, error.todo
+        return type(error)(*fields, deadline_s=error.deadline_s)
 
     def _watch(self) -> None:
-        """Run `enforce` whenever it is due; a lamp that is lit later is due later."""
+        """Run `enforce` whenever it is due."""
         with self._changed:
             while self._thread is threading.current_thread():
                 wait = self.enforce()

@@ -1,4 +1,4 @@
-"""What a light bank cannot do, told as errors."""
+"""Errors for what a light bank cannot do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
     """Raise `DeviceError` for a bank that cannot guarantee a blackout, unless that is accepted."""
     lacking = []
     if not can.reads_back:
-        lacking.append("no read-back: that the lamps are off is never known")
+        lacking.append("no read-back: the service cannot confirm that the lamps are off")
     if not can.dead_man:
         lacking.append("no dead-man: when the service or the cable dies, lit lamps stay lit")
     if lacking and not accepted:
@@ -21,8 +21,8 @@ def refuse_unverified_blackout(name: str, can: LightCapabilities, accepted: bool
 
 
 def level_word(name: str, doing: str, level: float, steps: int) -> int:
-    """A level of 0 to 1 for a bank of `steps` levels above 0; raises `ValueError` beyond, and
-    `DeviceError` for a level above 0 that would become 0."""
+    """A level of 0 to 1 in steps of 1 / `steps`. Raises `ValueError` outside 0 to 1, `DeviceError`
+    for a level above 0 that would become 0."""
     if not 0 <= level <= 1:
         raise ValueError(f"{name}: a level is 0 to 1, got {level}")
     if level > 0 and round(level * steps) == 0:
@@ -34,5 +34,5 @@ def level_word(name: str, doing: str, level: float, steps: int) -> int:
 
 def cannot(name: str, doing: str, lacks: str) -> DeviceError:
     """The error of a call that the capabilities exclude."""
-    todo = "Ask its capabilities first; [devices.lights] describes the bank."
+    todo = "Check its capabilities first; [devices.lights] describes the bank."
     return DeviceError(name, doing, lacks, "a light bank without", todo)

@@ -19,8 +19,8 @@ from stage_service.devices.lights.interface import (
 )
 from stage_service.devices.lights.modbus_links import (
     ModbusLink,
-    NotTheAnswer,
-    Unanswered,
+    NoReply,
+    WrongReply,
     open_link,
 )
 from stage_service.devices.lights.modbus_registers import (
@@ -34,20 +34,19 @@ log = logging.getLogger("hairstage.lights")
 ALL_ON, ALL_OFF = 65535, 0
 MOST_WRITTEN, MOST_READ = 122, 124  # even, so that a table's entries stay whole; of 123 and 125
 MOST_COILS = 1968
-_ATTEMPTS_TO_FALL_INTO_STEP = 3
+_ATTEMPTS = 3
 _EXCEPTIONS = {1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "refused now"}
 
 
 class _OutOfStep(DeviceError):
-    """The answer belongs to another request."""
+    """The reply belongs to another request."""
 
 
 class ModbusLightBank:
     """Implements `LightBank`; see there for the contract.
 
-    After any trouble the link is closed. The next request opens it anew, drains it and identifies
-    the bank before anything else is sent, so that no late answer is taken for a later one's.
-    Raises `RigError` where registers lie over each other.
+    Any failure closes the link; the next request opens it, drains it and identifies the bank first,
+    so that no late reply is taken for a later one's. Raises `RigError` where registers overlap.
     """
 
     def __init__(self, config: ModbusTcpConfig | ModbusRtuConfig, lamps: int) -> None:
@@ -70,13 +69,13 @@ class ModbusLightBank:
         self._link: ModbusLink | None = None
         self._identified = False
         self._out_of_step = False
-        self._falls = 0
+        self._resyncs = 0
         self._echo_logged = False
         self._lock = threading.RLock()
 
     def connect(self) -> None:
         """Connect; raises `DeviceError` where the peer is no light bank, has another size, or
-        cannot guarantee a blackout though the rig file does not accept that."""
+        cannot guarantee a blackout and the rig file does not accept that."""
         accepted = self.config.accept_unverified_blackout
         limits.refuse_unverified_blackout(self.name, self.capabilities, accepted)
         with self._lock:
@@ -102,22 +101,19 @@ class ModbusLightBank:
         doing = "putting all lamps off"
         with self._lock:
             if not self._identified:
-                # Before the link is trusted again: a bank whose answers are lost goes dark, too.
+                # Before the link is trusted: a bank whose replies are lost must go dark, too.
                 self._open(doing)
                 try:
                     self._put(ALL_OFF, doing)
                 except (DeviceTimeout, DeviceUnreachable):
                     raise
                 except DeviceError:
-                    pass  # said again, and confirmed, below
+                    pass  # sent again, and confirmed, below
             self._command(ALL_OFF, 0, doing)
             self._armed = 0
 
     def set_level(self, level: float) -> None:
-        """Set every lamp's level in chunks, unless it is set already.
-
-        A bank without level registers has its lamps at 1.
-        """
+        """Set every lamp's level, unless it is set already; without level registers it is 1."""
         doing = f"setting the level to {level:g}"
         if self._map.levels is None and level == 1.0:
             return
@@ -137,8 +133,8 @@ class ModbusLightBank:
         self._write([round(seconds * 1000)], register, doing)
 
     def heartbeat(self) -> None:
-        """Feed the watchdog. Raises where the bank is no longer whose it was: by a power-up, after
-        which levels are full and no sequence is armed, or by another service."""
+        """Feed the watchdog. Raises where the bank has lost its owner: by a power-up, after which
+        levels are full and no sequence is armed, or to another service."""
         doing = "sending a heartbeat"
         register = self._required(self._map.heartbeat, doing, "a heartbeat register")
         with self._lock:
@@ -149,15 +145,15 @@ class ModbusLightBank:
             if held != self._owner:
                 self._level = self._armed = None
                 expected = f"the bank to be service {self._owner}'s"
-                received = f"that of service {held}" if held else "nobody's: it was started anew"
-                todo = "What was shot since the last heartbeat may be lit at another level: see to "
-                todo += "the bank's supply and to other services, then resume or shoot again."
+                received = f"service {held}'s" if held else "no owner: the bank was powered up"
+                todo = "Frames since the last heartbeat may be lit at another level: check the "
+                todo += "bank's supply and other services, then resume or shoot again."
                 raise self._error(doing, expected, received, todo)
 
     def claim(self, number: int, name: str) -> str | None:
         """Write `number` to the owner register, which refuses it (exception 4) while it holds
-        another's, and the name behind it."""
-        doing = "taking the stage" if number else "giving the stage up"
+        another service's, and the name into the registers behind it."""
+        doing = "taking the stage" if number else "releasing the stage"
         first = self._required(self._map.owner, doing, "an owner register")
         with self._lock:
             self._trust()
@@ -238,14 +234,14 @@ class ModbusLightBank:
 
     def _put(self, selector: int, doing: str) -> None:
         if selector == ALL_OFF and self._map.sequence is not None and self._armed != 0:
-            # Leaves the sequence, which refuses the selector, and puts all lamps off.
+            # An armed sequence refuses the selector; this leaves it and puts all lamps off.
             self._exchange(doing, "write_register", self._map.sequence, 0)
         if self._map.selector is not None:
             self._exchange(doing, "write_register", self._map.selector, selector)
             return
         on = [selector in (ALL_ON, lamp + 1) for lamp in range(self.count)]
         starts = range(0, self.count, MOST_COILS)
-        # Dark ones first: never two lamps where one is wanted.
+        # Chunks without a lit lamp first, so that never two lamps are on.
         for start in sorted(starts, key=lambda s: any(on[s : s + MOST_COILS])):
             part = on[start : start + MOST_COILS]
             self._exchange(doing, "write_coils", self._map.coils + start, part)
@@ -277,31 +273,31 @@ class ModbusLightBank:
             return frames.registers(self._exchange(doing, method, address, count))
 
     def _trust(self) -> None:
-        """Have an open link to the right bank on which no answer is late."""
+        """Open a link to the right bank on which no reply is late, unless there is one."""
         if self._identified:
             return
-        for attempt in range(1, _ATTEMPTS_TO_FALL_INTO_STEP + 1):
+        for attempt in range(1, _ATTEMPTS + 1):
             self._open("connecting")
             try:
-                self._fall_into_step()
+                self._resynchronise()
                 self._log_echo()
                 break
             except _OutOfStep:
-                if attempt == _ATTEMPTS_TO_FALL_INTO_STEP:
+                if attempt == _ATTEMPTS:
                     raise
         self._identify()
         self._identified = True
 
-    def _fall_into_step(self) -> None:
-        """Read something whose answer has another length than the last times, so that a late one
-        is told from this one's."""
-        doing = "falling into step"
-        self._falls += 1
+    def _resynchronise(self) -> None:
+        """Read a number of registers that differs from the last times, so that a late reply has
+        another length than this one's."""
+        doing = "resynchronising"
+        self._resyncs += 1
         if self._map.levels is not None:
-            count = 1 + self._falls % min(self.count, MOST_READ)
+            count = 1 + self._resyncs % min(self.count, MOST_READ)
             self._exchange(doing, "read_holding_registers", self._map.levels, count)
         else:
-            count = 1 + 8 * self._falls % min(self.count, MOST_COILS)
+            count = 1 + 8 * self._resyncs % min(self.count, MOST_COILS)
             self._exchange(doing, "read_coils", self._map.coils, count)
 
     def _log_echo(self) -> None:
@@ -324,8 +320,8 @@ class ModbusLightBank:
                 expected = f"{self.count} lamps as in the rig file"
                 raise self._error(doing, expected, f"{lamps}", "Use the rig file of this stage.")
         if r.sequence is not None:
-            answer = self._exchange(doing, "read_holding_registers", r.sequence, 1)
-            (self._armed,) = frames.registers(answer)
+            reply = self._exchange(doing, "read_holding_registers", r.sequence, 1)
+            (self._armed,) = frames.registers(reply)
 
     def _open(self, doing: str) -> None:
         if self._link is not None:
@@ -333,7 +329,7 @@ class ModbusLightBank:
         try:
             self._link = open_link(self.config)
             if self._out_of_step:
-                # Late answers come one after the other now: let them pass.
+                # Late replies may still come: drop them.
                 self._link.drain(self.config.timeout_s)
                 self._out_of_step = False
         except OSError as error:
@@ -346,29 +342,29 @@ class ModbusLightBank:
     def _exchange(
         self, doing: str, method: str, address: int, payload: int | Sequence[int]
     ) -> bytes:
-        """One request: `payload` is the count of a read, else what is written, a number alone for
-        "write_register". Returns the right answer, without its frame."""
+        """One request: `payload` is the count of a read, else the values written, a single number
+        for "write_register". Returns the right reply, without its frame."""
         assert self._link is not None
         sent = frames.request(method, address, payload)
         try:
-            answer = self._link.exchange(sent)
-        except (Unanswered, OSError) as error:
-            raise self._unanswered(doing, error) from error
-        except NotTheAnswer as other:
-            raise self._other_answer(
+            reply = self._link.exchange(sent)
+        except (NoReply, OSError) as error:
+            raise self._no_reply(doing, error) from error
+        except WrongReply as other:
+            raise self._other_reply(
                 doing, f"{frames.expected(sent)}, {other.expected}", other
             ) from other
-        if answer[0] == sent[0] | frames.EXCEPTION and len(answer) == frames.EXCEPTION_SIZE:
-            code = answer[1]
+        if reply[0] == sent[0] | frames.EXCEPTION and len(reply) == frames.EXCEPTION_SIZE:
+            code = reply[1]
             received = f"Modbus exception {code} ({_EXCEPTIONS.get(code, 'see its manual')})"
             todo = "Check the registers in [devices.lights]; 4 also says that a sequence is armed."
-            raise self._error(doing, "an answer", received, todo)
-        if not frames.is_right(sent, answer):
-            raise self._other_answer(doing, frames.expected(sent), frames.shown(answer))
-        return answer
+            raise self._error(doing, "a reply", received, todo)
+        if not frames.is_right(sent, reply):
+            raise self._other_reply(doing, frames.expected(sent), frames.shown(reply))
+        return reply
 
-    def _unanswered(self, doing: str, error: Unanswered | OSError) -> DeviceError:
-        """What to raise where no answer came; the link is closed."""
+    def _no_reply(self, doing: str, error: NoReply | OSError) -> DeviceError:
+        """The error where no reply came; closes the link."""
         self.close()
         left = "its watchdog puts the lamps off"
         if not self.capabilities.dead_man:
@@ -377,23 +373,23 @@ class ModbusLightBank:
         timeout_s = self.config.timeout_s
         if isinstance(error, OSError):
             got = f"none ({error})"
-            return DeviceUnreachable(self.name, doing, "an answer", got, todo, timeout_s)
+            return DeviceUnreachable(self.name, doing, "a reply", got, todo, timeout_s)
         got = frames.unusable(error.received)
         if error.echo:
-            got = "its own request alone, which comes back"
+            got = "only an echo of the request"
             if isinstance(self.config, ModbusRtuConfig):
                 todo += f" The adapter on {self.config.port} echoes: switch its local echo off."
             else:
-                todo = f"What listens there is no light bank: check host and port; {left}."
-        return DeviceTimeout(self.name, doing, "an answer", got, todo, timeout_s)
+                todo = f"The device there is no light bank: check host and port; {left}."
+        return DeviceTimeout(self.name, doing, "a reply", got, todo, timeout_s)
 
-    def _other_answer(self, doing: str, expected: str, received: object) -> _OutOfStep:
-        """What to raise for an answer to something else; the link is closed."""
+    def _other_reply(self, doing: str, expected: str, received: object) -> _OutOfStep:
+        """The error for a reply to another request; closes the link."""
         self.close()
         self._out_of_step = True
-        todo = "Answers were out of step; the next request opens the link anew. If it "
+        todo = "Replies were out of step; the next request opens the link again. If it "
         todo += "happens again, look for a second master."
-        return _OutOfStep(self.name, doing, f"the answer {expected}", f"{received}", todo)
+        return _OutOfStep(self.name, doing, f"the reply {expected}", f"{received}", todo)
 
     def _required(self, address: int | None, doing: str, what: str) -> int:
         if address is None:

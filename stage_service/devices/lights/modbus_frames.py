@@ -1,4 +1,4 @@
-"""Modbus requests and answers as bytes, and as texts for errors.
+"""Modbus requests and replies as bytes, and as texts for errors.
 
 Sources: Modbus Application Protocol 1.1b3 (the functions), Modbus over Serial Line 1.02 (the CRC).
 """
@@ -24,7 +24,7 @@ _WRITES = (5, 6, 15, 16)
 
 
 def request(method: str, address: int, payload: int | Sequence[int]) -> bytes:
-    """A request without its frame: `payload` is the count of a read, else what is written."""
+    """A request without its frame: `payload` is the count of a read, else the values written."""
     code = CODES[method]
     if isinstance(payload, int):
         return struct.pack(">BHH", code, address, payload)
@@ -39,48 +39,43 @@ def request(method: str, address: int, payload: int | Sequence[int]) -> bytes:
 
 
 def right_size(sent: bytes) -> int:
-    """How many bytes the right answer to a request has, without its frame."""
+    """Bytes of the right reply to a request, without its frame."""
     code, count = sent[0], int.from_bytes(sent[3:5], "big")
     if code not in _READS:
         return _WRITTEN_SIZE
     return 2 + (-(-count // 8) if code == 1 else 2 * count)
 
 
-def is_right(sent: bytes, answer: bytes) -> bool:
-    """Whether an answer is one to this request; its exception is none."""
-    if len(answer) != right_size(sent) or answer[0] != sent[0]:
+def is_right(sent: bytes, reply: bytes) -> bool:
+    """Whether a reply is a right one to this request; an exception is not."""
+    if len(reply) != right_size(sent) or reply[0] != sent[0]:
         return False
     if sent[0] in _READS:
-        return answer[1] == len(answer) - 2
-    return answer == sent[:_WRITTEN_SIZE]
+        return reply[1] == len(reply) - 2
+    return reply == sent[:_WRITTEN_SIZE]
 
 
-def registers(answer: bytes) -> list[int]:
-    """The words of a right answer to a read of registers."""
-    return list(struct.unpack(f">{answer[1] // 2}H", answer[2:]))
-
-
-def bits(answer: bytes, count: int) -> list[bool]:
-    """The first `count` bits of a right answer to a read of coils."""
-    return [bool(answer[2 + i // 8] >> i % 8 & 1) for i in range(count)]
+def registers(reply: bytes) -> list[int]:
+    """The words of a right reply to a read of registers."""
+    return list(struct.unpack(f">{reply[1] // 2}H", reply[2:]))
 
 
 def expected(sent: bytes) -> str:
-    """What the right answer to a request is, as `shown` has it."""
+    """The right reply to a request in words, see `shown`."""
     code, address, number = struct.unpack(">BHH", sent[:5])
     if code in _READS:
         return _shown_read(code, right_size(sent) - 2)
     return _shown_write(code, address, number)
 
 
-def shown(answer: bytes) -> str:
-    """What an answer is, in words."""
-    code = answer[0]
-    if code in _READS and len(answer) >= 2 and len(answer) == 2 + answer[1]:
-        return _shown_read(code, answer[1])
-    if code in _WRITES and len(answer) == _WRITTEN_SIZE:
-        return _shown_write(*struct.unpack(">BHH", answer))
-    return f"function {code} in {len(answer)} bytes"
+def shown(reply: bytes) -> str:
+    """A reply in words."""
+    code = reply[0]
+    if code in _READS and len(reply) >= 2 and len(reply) == 2 + reply[1]:
+        return _shown_read(code, reply[1])
+    if code in _WRITES and len(reply) == _WRITTEN_SIZE:
+        return _shown_write(*struct.unpack(">BHH", reply))
+    return f"function {code} in {len(reply)} bytes"
 
 
 def _shown_read(code: int, size: int) -> str:
@@ -92,9 +87,9 @@ def _shown_write(code: int, address: int, number: int) -> str:
 
 
 def unusable(data: bytes) -> str:
-    """What came instead of an answer."""
+    """Received bytes that are no reply, in words."""
     text = data[:32].hex(" ") + (" …" if len(data) > 32 else "")
-    return f"no answer in {len(data)} bytes: {text}" if data else "nothing"
+    return f"no reply in {len(data)} bytes: {text}" if data else "nothing"
 
 
 def with_crc(data: bytes) -> bytes:
@@ -103,7 +98,7 @@ def with_crc(data: bytes) -> bytes:
 
 
 def rtu_frame(data: bytes) -> bytes | None:
-    """The whole answer that `data` begins with, frame and all; None where there is none yet."""
+    """The complete reply at the start of `data`, with its frame; None if it is incomplete."""
     if len(data) < 3:
         return None
     code = data[1]

@@ -1,8 +1,8 @@
-"""Modbus links, TCP and RTU: one request at a time, one strict deadline each, every byte looked at.
+"""Modbus links, TCP and RTU: one request at a time, each with a deadline; every byte is checked.
 
-On an RS-485 line the adapter may hear its own request (a local echo), which looks like the answer
-to a write of one register. So a line is known to echo, or not to, from a read, whose echo looks
-like no answer to it; the driver reads before it believes the answer to any write.
+An RS-485 adapter may echo its own request, which looks like the reply to a write of one register.
+Whether a line echoes is determined from a read, whose echo looks like no reply; the driver reads
+before it trusts the reply to any write.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ _FASTEST_FIXED = 19200
 _SILENCE_S = 1.75e-3
 _MOST_DRAINED = 100
 _NOISE = b"\0\xff"
-"""What an RS-485 line that changes direction reads as: addresses that no unit may have."""
+"""Bytes read while an RS-485 line changes direction: addresses that no unit may have."""
 _ECHO_S = 0.05
-"""An answer that may be the echo of its request is waited for so long behind that."""
+"""Wait for a reply behind bytes that may be the echo of its request."""
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol, bytes that follow, unit
 
 
-class Unanswered(Exception):
-    """No answer came; `received` did before the deadline, `echo`: the request and no more."""
+class NoReply(Exception):
+    """No reply before the deadline, but `received`; `echo`: that is the request itself."""
 
     def __init__(self, received: bytes, echo: bool = False) -> None:
         super().__init__(frames.unusable(received))
         self.received, self.echo = received, echo
 
 
-class NotTheAnswer(Exception):
-    """An answer to something else, or with something around it; both in words."""
+class WrongReply(Exception):
+    """A reply to another request, or surrounded by other bytes; both in words."""
 
     def __init__(self, expected: str, received: str) -> None:
         super().__init__(received)
@@ -61,7 +61,7 @@ def character_s(config: ModbusRtuConfig) -> float:
 class ModbusLink(ABC):
     """An open link; making one raises `OSError` with the reason.
 
-    `echoes`: whether requests come back before their answers; None: not known yet, and the answer
+    `echoes`: whether requests are echoed before their replies; None: not known yet, and the reply
     to a write of one register may be an echo.
     """
 
@@ -69,12 +69,12 @@ class ModbusLink(ABC):
 
     @abstractmethod
     def exchange(self, request: bytes) -> bytes:
-        """The answer to a request, both without frames: a right one, an exception, or one of
-        another function or content. Raises `Unanswered`, `NotTheAnswer`, `OSError`."""
+        """The reply to a request, both without frames: a right one, an exception, or one of
+        another function or content. Raises `NoReply`, `WrongReply`, `OSError`."""
 
     @abstractmethod
     def drain(self, quiet_s: float) -> None:
-        """Drop what comes until nothing has come for `quiet_s`; raises `OSError`."""
+        """Drop input until there is none for `quiet_s` seconds; raises `OSError`."""
 
     @abstractmethod
     def close(self) -> None:
@@ -82,7 +82,7 @@ class ModbusLink(ABC):
 
 
 class TcpLink(ModbusLink):
-    """On TCP, where nothing may come that is not the answer."""
+    """On TCP, where any byte beside the reply is an error."""
 
     echoes = False
 
@@ -96,7 +96,7 @@ class TcpLink(ModbusLink):
         self._socket.close()
 
     def drain(self, quiet_s: float) -> None:
-        """A new connection carries nothing old."""
+        """A new connection has no old input."""
 
     def exchange(self, request: bytes) -> bytes:
         config = self._config
@@ -106,23 +106,23 @@ class TcpLink(ModbusLink):
         sent = _HEADER.pack(self._transaction, 0, len(request) + 1, config.unit) + request
         self._socket.sendall(sent)
         if early:
-            raise NotTheAnswer("nothing before the request", frames.unusable(early))
+            raise WrongReply("nothing before the request", frames.unusable(early))
         came = b""
         while (size := self._size(came, sent)) is None or len(came) < size:
             if not (more := _receive(self._socket.fileno(), deadline - time.monotonic())):
-                raise Unanswered(came)
+                raise NoReply(came)
             came += more
         if len(came) > size:
-            raise NotTheAnswer("nothing behind it", frames.unusable(came[size:]))
+            raise WrongReply("nothing behind it", frames.unusable(came[size:]))
         return came[_HEADER.size :]
 
     def _size(self, came: bytes, sent: bytes) -> int | None:
-        """Bytes of the whole answer that begins so, None where that is not known yet. Raises
-        `NotTheAnswer` for a header that is not of the answer, `Unanswered` for the request."""
+        """Bytes of the complete reply that starts with `came`, None if not known yet. Raises
+        `WrongReply` for a header of another reply, `NoReply` for an echo."""
         request = sent[_HEADER.size :]
-        if not _echo_like_answer(request):
+        if not _echo_like_reply(request):
             if came.startswith(sent):
-                raise Unanswered(came, echo=True)
+                raise NoReply(came, echo=True)
             if sent.startswith(came):
                 return None
         if len(came) <= _HEADER.size:
@@ -132,12 +132,12 @@ class TcpLink(ModbusLink):
         size = frames.EXCEPTION_SIZE if exception else frames.right_size(request)
         right = (self._transaction, 0, size + 1, self._config.unit)
         if header != right:
-            raise NotTheAnswer(_shown(right), _shown(header))
+            raise WrongReply(_shown(right), _shown(header))
         return _HEADER.size + size
 
 
 class RtuLink(ModbusLink):
-    """On a serial line, where an adapter may echo, and noise may surround an answer."""
+    """On a serial line, where an adapter may echo and noise may surround a reply."""
 
     def __init__(self, config: ModbusRtuConfig) -> None:
         self._config = config
@@ -166,31 +166,31 @@ class RtuLink(ModbusLink):
         sent = frames.with_crc(bytes([config.unit]) + request)
         time.sleep(max(0.0, self._quiet_since + silence_s(config) - time.monotonic()))
         try:
-            self._port.reset_input_buffer()  # what is there belongs to an older request
+            self._port.reset_input_buffer()  # of an older request
         except termios.error as error:
             raise OSError(*error.args) from error
         # The deadline is the device's: the time on the wire is on top.
         deadline = time.monotonic() + config.timeout_s + len(sent) * character_s(config)
         self._port.write(sent)
         came = b""
-        while (answer := self._answer(came, sent)) is None:
+        while (reply := self._reply(came, sent)) is None:
             if not (more := self._more(deadline - time.monotonic())):
-                raise Unanswered(came, echo=came.strip(_NOISE) == sent.strip(_NOISE))
+                raise NoReply(came, echo=came.strip(_NOISE) == sent.strip(_NOISE))
             came += more
-        if self.echoes is None and answer == sent:  # or an echo, and the answer is still to come
+        if self.echoes is None and reply == sent:  # or an echo, with the reply behind it
             self._more(_ECHO_S)
-        return answer[1:-2]
+        return reply[1:-2]
 
     def _more(self, within_s: float) -> bytes:
         data = _receive(self._port.fileno(), within_s)
         self._quiet_since = time.monotonic()
         return data
 
-    def _answer(self, came: bytes, sent: bytes) -> bytes | None:
-        """The answer's frame in what came, None as long as there is none; learns whether the line
-        echoes, where that can be told. Raises `NotTheAnswer`."""
+    def _reply(self, came: bytes, sent: bytes) -> bytes | None:
+        """The reply's frame in `came`, None while there is none; sets `echoes` once it can be
+        determined. Raises `WrongReply`."""
         rest = came.lstrip(_NOISE)
-        could_be = _echo_like_answer(sent[1:])
+        could_be = _echo_like_reply(sent[1:])
         echoed = rest.startswith(sent) and (self.echoes is True or not could_be)
         if echoed and self.echoes is not False:
             rest = rest[len(sent) :].lstrip(_NOISE)
@@ -201,9 +201,9 @@ class RtuLink(ModbusLink):
             return None
         behind = rest[len(frame) :].rstrip(_NOISE)
         if behind and not (self.echoes is None and could_be):
-            raise NotTheAnswer("nothing behind it", frames.unusable(behind))
+            raise WrongReply("nothing behind it", frames.unusable(behind))
         if frame[0] != self._config.unit:
-            raise NotTheAnswer(f"unit {self._config.unit}", f"unit {frame[0]}")
+            raise WrongReply(f"unit {self._config.unit}", f"unit {frame[0]}")
         if self.echoes is None and not could_be and frames.is_right(sent[1:-2], frame[1:-2]):
             self.echoes = echoed
         return frame
@@ -214,13 +214,13 @@ def open_link(config: ModbusTcpConfig | ModbusRtuConfig) -> ModbusLink:
     return RtuLink(config) if isinstance(config, ModbusRtuConfig) else TcpLink(config)
 
 
-def _echo_like_answer(request: bytes) -> bool:
-    """Whether the right answer to it is the same: a write of one register is repeated."""
+def _echo_like_reply(request: bytes) -> bool:
+    """Whether the right reply equals the request, as for a write of one register."""
     return request[0] == frames.CODES["write_register"]
 
 
 def _receive(descriptor: int, within_s: float) -> bytes:
-    """What there is, as soon as there is any; nothing where nothing came in time."""
+    """The next bytes; empty if none came in time."""
     if not select.select([descriptor], [], [], max(0.0, within_s))[0]:
         return b""
     data = os.read(descriptor, 4096)

@@ -1,4 +1,4 @@
-"""The light bank's register map: what may not overlap, and the owner's name in registers."""
+"""The light bank's register map: overlaps, and the owner's name as registers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ TABLE_ENTRIES = 4096
 
 
 def check_apart(registers: LightRegisters, lamps: int) -> None:
-    """Raise `RigError` where two holding registers share an address: the level of lamp 1000,
-    written where the selector is, would be a command."""
+    """Raise `RigError` where two holding registers share an address: a level written to the
+    selector would be a command."""
     many = {"levels": lamps, "owner": OWNER_WORDS, "table": 2 * TABLE_ENTRIES}
     found: dict[int, str] = {}
     for name in ("levels", "selector", "heartbeat", "watchdog", "sequence", "owner", "table"):
@@ -18,8 +18,8 @@ def check_apart(registers: LightRegisters, lamps: int) -> None:
         for address in () if first is None else range(first, first + many.get(name, 1)):
             if (other := found.setdefault(address, name)) != name:
                 raise RigError(
-                    f"devices.lights.registers: {name} lies over {other} at {address}, with "
-                    f"{lamps} lamps: give each addresses of its own, as the bank has them"
+                    f"devices.lights.registers: {name} overlaps {other} at {address}, with "
+                    f"{lamps} lamps: give each the addresses that the bank has"
                 )
 
 

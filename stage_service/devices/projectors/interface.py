@@ -1,4 +1,4 @@
-"""What the sequencer asks of a projector controller."""
+"""The interface of a projector controller."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Protocol
 
 @dataclass(frozen=True)
 class ProjectorCapabilities:
-    """What link and device can do.
+    """Abilities of link and device.
 
-    `reads_back`: a blackout can be verified. `dead_man`: the projectors go dark by themselves when
-    nobody asks. `table`: entries of its sequence, which steps with the trigger box; 0: no sequence.
+    `reads_back`: a blackout can be verified. `dead_man`: the projectors go dark by themselves
+    without requests. `table`: entries of its sequence, which the trigger box steps; 0: no sequence.
     """
 
     reads_back: bool
@@ -22,7 +22,7 @@ class ProjectorCapabilities:
 
 @dataclass(frozen=True)
 class Pattern:
-    """What one step of a sequence shows at `level`, 0 to 1: a row, or everything (no projector)."""
+    """One step of a sequence at `level`, 0 to 1: a row, or every row (no projector)."""
 
     level: float
     projector: str | None = None
@@ -32,29 +32,29 @@ class Pattern:
 class ProjectorController(Protocol):
     """Shows scanlines. Safe to call from several threads.
 
-    Every call raises `DeviceError`; what the capabilities exclude raises it, too. `line`, `all_on`
-    and `load_sequence` raise `NotPermitted` where the thread uses no live permission.
+    Every call raises `DeviceError`, also where the capabilities exclude it. `line`, `all_on` and
+    `load_sequence` raise `NotPermitted` without a live permission of the calling thread.
     """
 
     name: str
     capabilities: ProjectorCapabilities
-    """Known after `connect`; nothing is promised before."""
+    """Known after `connect`."""
 
     @property
     def names(self) -> tuple[str, ...]:
         """The projectors that the controller drives; known after `connect`."""
 
     def connect(self) -> None:
-        """Open the link and check that the right device answers."""
+        """Open the link and check the device's identity."""
 
     def close(self) -> None:
         """Close the link; the projectors stay as they are."""
 
     def line(self, projector: str, row: int, level: float) -> None:
-        """Let one projector show one row at `level`, 0 to 1; every other one is dark."""
+        """Show one row of one projector at `level`, 0 to 1; the others are dark."""
 
     def all_on(self, level: float) -> None:
-        """Let every projector show every row at `level`, 0 to 1."""
+        """Show every row of every projector at `level`, 0 to 1."""
 
     def off(self) -> None:
         """Put every projector dark and leave a sequence."""
@@ -66,11 +66,11 @@ class ProjectorController(Protocol):
         """Upload one pattern per step, verify and arm it: all dark until the gate opens."""
 
     def position(self) -> int:
-        """How many patterns of the armed sequence are over. Raises when none is armed any more:
-        a command left it, or the watchdog did."""
+        """How many patterns of the armed sequence are over. Raises when none is armed, because a
+        command or the watchdog left it."""
 
     def set_watchdog(self, seconds: float) -> None:
         """Set after how long without a request the projectors go dark and leave a sequence."""
 
     def heartbeat(self) -> None:
-        """Tell the watchdog that somebody is there."""
+        """Feed the watchdog."""

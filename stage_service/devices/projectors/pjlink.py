@@ -28,7 +28,7 @@ _ERRORS = {
 
 
 class Power(IntEnum):
-    """What a projector says of itself."""
+    """A projector's power state."""
 
     STANDBY = 0
     ON = 1
@@ -45,16 +45,16 @@ class Lamp:
 
 
 class ProjectorBusy(DeviceError):
-    """The projector cannot do this now, ERR3; later it can."""
+    """The projector is temporarily unable to do this (ERR3)."""
 
 
 @dataclass(frozen=True)
 class PjLinkProjector:
-    """One projector; `password` is a text or the file that holds it, read when the projector asks,
-    empty where it never does. Safe to call from several threads.
+    """One projector; `password` is a text or the file that holds it, empty where there is none.
+    Safe to call from several threads.
 
-    Every exchange, with connecting, is over within `timeout_s` and has a connection of its own:
-    projectors drop idle ones, and no late answer can pass for the next. Raises `DeviceError`:
+    Every exchange has a connection of its own, because projectors drop idle ones, and ends within
+    `timeout_s`. Raises `DeviceError`:
     `DeviceTimeout` for a missed deadline, `DeviceUnreachable` for a connection refused or lost,
     `ProjectorBusy` for ERR3.
     """
@@ -67,32 +67,34 @@ class PjLinkProjector:
 
     @property
     def name(self) -> str:
-        """As errors name it."""
+        """The name in errors."""
         return f"projector {self.projector} (PJLink {self.host}:{self.port})"
 
     def power(self) -> Power:
         """The power state that it reports."""
-        return Power(int(self._ask("POWR ?", "[0-3]", "0, 1, 2 or 3", "reading the power state")))
+        return Power(
+            int(self._request("POWR ?", "[0-3]", "0, 1, 2 or 3", "reading the power state"))
+        )
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Hours of each lamp; empty where it has none to count (ERR1)."""
+        """Hours of each lamp; empty where it counts none (ERR1)."""
         doing = "reading the lamp hours"
         pattern = r"\d{1,5} [01](?: \d{1,5} [01]){0,7}|ERR1"
         shown = "hours and 0 or 1 for each of up to 8 lamps"
-        answer = self._ask("LAMP ?", pattern, shown, doing)
-        if answer == "ERR1":
+        reply = self._request("LAMP ?", pattern, shown, doing)
+        if reply == "ERR1":
             return ()
-        words = answer.split(" ")
+        words = reply.split(" ")
         pairs = zip(words[::2], words[1::2], strict=True)
         return tuple(Lamp(int(hours), lit == "1") for hours, lit in pairs)
 
     def switch(self, on: bool) -> None:
-        """Ask for power on or standby. OK means accepted: `power` says when it is reached."""
-        self._ask(f"POWR {on:d}", "OK", "OK", f"switching the power {'on' if on else 'off'}")
+        """Request power on or standby. OK means accepted: `power` shows when it is reached."""
+        self._request(f"POWR {on:d}", "OK", "OK", f"switching the power {'on' if on else 'off'}")
 
-    def _ask(self, command: str, answer: str, shown: str, doing: str) -> str:
-        """Send `command` and return what follows `=` in its answer: a match of the pattern
-        `answer`, which an error names as `shown`."""
+    def _request(self, command: str, pattern: str, shown: str, doing: str) -> str:
+        """Send `command` and return what follows `=` in its reply: a match of `pattern`, which
+        errors describe as `shown`."""
         deadline = time.monotonic() + self.timeout_s
         try:
             with socket.create_connection((self.host, self.port), self.timeout_s) as link:
@@ -102,18 +104,18 @@ class PjLinkProjector:
                 line = _line(link, deadline)
         except _Incomplete as cut:
             received = f"{cut}, and the connection was closed"
-            todo = "The projector takes few connections at once: see who else uses it."
-            expected = "an answer that ends in CR"
+            todo = "The projector takes few connections at once: check what else uses it."
+            expected = "a reply that ends in CR"
             raise self._error(DeviceUnreachable, doing, expected, received, todo) from cut
         except TimeoutError as error:
             todo = "Check the projector's network standby setting, cable and address."
-            raise self._error(DeviceTimeout, doing, "an answer", str(error), todo) from error
+            raise self._error(DeviceTimeout, doing, "a reply", str(error), todo) from error
         except OSError as error:
             todo = "Check address, network and that PJLink is enabled in the projector."
             raise self._error(DeviceUnreachable, doing, "a connection", str(error), todo) from error
         if re.fullmatch("PJLINK ERRA", line, re.IGNORECASE):
             self._not_authenticated("ERRA: the password is wrong", doing)
-        match = re.fullmatch(rf"%1{command[:4]}=({answer})", line, re.IGNORECASE)
+        match = re.fullmatch(rf"%1{command[:4]}=({pattern})", line, re.IGNORECASE)
         if match is not None:
             return match[1].upper()
         number = re.fullmatch(rf"%1{command[:4]}=ERR([1-4])", line, re.IGNORECASE)
@@ -123,7 +125,7 @@ class PjLinkProjector:
         raise self._error(kind, doing, f"%1{command[:4]}= and {shown}", received, todo)
 
     def _digest(self, greeting: str, doing: str) -> str:
-        """What goes in front of the first command: nothing, or the MD5 digest."""
+        """The prefix of the first command: empty, or the MD5 digest."""
         match = re.fullmatch(r"PJLINK (?:0|1 ([0-9a-f]{8}))", greeting, re.IGNORECASE)
         if match is None:
             if re.fullmatch("PJLINK ERRA", greeting, re.IGNORECASE):
@@ -135,8 +137,8 @@ class PjLinkProjector:
             return ""
         password = self._password(doing)
         if not password:
-            self._not_authenticated("a greeting that asks for one", doing)
-        # The protocol has MD5; it keeps the password off the wire, no more.
+            self._not_authenticated("a greeting that requests one", doing)
+        # The protocol prescribes MD5; it only keeps the password off the wire.
         text = (match[1] + password).encode()
         return hashlib.md5(text, usedforsecurity=False).hexdigest()
 
@@ -172,7 +174,7 @@ def _left(deadline: float) -> float:
 
 
 def _line(link: socket.socket, deadline: float) -> str:
-    """The next line; garbage bytes are kept, visibly, for the error message."""
+    """The next line; bytes outside ASCII are escaped for the error message."""
     data = b""
     while b"\r" not in data and len(data) < _LONGEST_LINE:
         try:

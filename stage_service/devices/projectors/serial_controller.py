@@ -15,7 +15,7 @@ IDENTITY = Identity(
     "HAIRSTAGE-PROJECTORS",
     re.compile(r"HAIRSTAGE-PROJECTORS (?:2 (\d+) )?(\S*)"),
     "a projector controller: 'HAIRSTAGE-PROJECTORS 2', the entries that it holds and the "
-    "projectors' names, parted by commas, without blanks; or the names alone",
+    "projectors' names, separated by commas, without blanks; or the names alone",
 )
 
 
@@ -77,11 +77,9 @@ class SerialProjectorController:
         if match[1] != "armed":
             tripped = match[1] == "watchdog"
             received = f"{match[1]}, after {match[2]} patterns"
-            todo = (
-                "It got no request for the watchdog time and put the projectors dark."
-                if tripped
-                else "Load the sequence first; line, all_on and off leave it."
-            )
+            todo = "Load the sequence first; line, all_on and off leave it."
+            if tripped:
+                todo = "It received no request for the watchdog time and put the projectors dark."
             raise DeviceError(self.name, doing, "an armed sequence", received, todo)
         return int(match[2])
 
@@ -95,7 +93,7 @@ class SerialProjectorController:
 
 
 def _runs(patterns: Sequence[Pattern]) -> list[list[Pattern]]:
-    """Neighbours that one entry describes: rows of a projector at equal steps and one level."""
+    """Consecutive patterns that one entry describes: rows at equal steps and one level."""
     runs: list[list[Pattern]] = []
     for pattern in patterns:
         run = runs[-1] if runs else []

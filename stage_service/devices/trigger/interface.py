@@ -1,4 +1,4 @@
-"""What the sequencer asks of a trigger box."""
+"""The interface of a trigger box."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 
 @dataclass(frozen=True)
 class TriggerStatus:
-    """The stage's safety inputs as the box sees them; reported, never cleared from here."""
+    """The stage's safety inputs; the service never clears them."""
 
     interlock_open: bool
     estop_pressed: bool
@@ -22,7 +22,7 @@ TableState = Literal["idle", "armed", "running", "done", "stopped"]
 
 @dataclass(frozen=True)
 class TableRow:
-    """`repeat` steps alike of a hardware-stepped sequence; times in seconds.
+    """`repeat` equal steps of a hardware-stepped sequence; times in seconds.
 
     `gates` open ("L" light bank, "P" projectors), `settle_s` later the cameras fire, after
     `exposure_s` the gates close; the next step begins `period_s` after this one at the earliest.
@@ -38,10 +38,10 @@ class TableRow:
 
 @dataclass(frozen=True)
 class TableProgress:
-    """Where a table is: `steps` and `pulses` since `go`; `reason` says why it stopped, or "-".
+    """Progress of a table: `steps` and `pulses` since `go`; `reason`: why it stopped, or "-".
 
-    A step counts when its gates have closed, a pulse when the cameras fire: within an exposure, and
-    where a table was stopped in one, `pulses` is `steps` + 1.
+    A step counts once its gates have closed, a pulse once the cameras fire: during an exposure, and
+    after a stop in one, `pulses` is `steps` + 1.
     """
 
     state: TableState
@@ -60,14 +60,14 @@ class TriggerBox(Protocol):
         """Rows of its table, 0 where it has none; known after `connect`."""
 
     def connect(self) -> None:
-        """Open the link and check that the right device answers."""
+        """Open the link and check the device's identity."""
 
     def close(self) -> None:
         """Close the link."""
 
     def pulse(self, exposure_s: float) -> int:
-        """Fire once; returns the count, this pulse included. Never repeated on its own: a pulse
-        whose answer is lost may have fired."""
+        """Fire once; returns the count, this pulse included. Not repeated after a lost reply: the
+        pulse may have fired."""
 
     def count(self) -> int:
         """Pulses since `reset` or power-up."""
@@ -79,17 +79,17 @@ class TriggerBox(Protocol):
         """Read the safety inputs."""
 
     def load_table(self, rows: Sequence[TableRow], watchdog_s: float) -> None:
-        """Upload a table, verify its checksum, and arm it; it stops by itself when nobody asks
-        for `watchdog_s` seconds. Raises `ValueError` for times out of range; `DeviceError` where
-        the box has no table, or too short a one. Neighbours alike share a row of the table."""
+        """Upload a table, verify its checksum, and arm it; the box stops it after `watchdog_s`
+        seconds without a request. Raises `ValueError` for times out of range, `DeviceError` where
+        the box has no table or too short a one. Consecutive equal rows share one."""
 
     def go(self) -> None:
-        """Run the armed table from its first step, which opens the gates of lamps and projectors.
-        Never repeated on its own: the table of a lost answer may run; `stop` ends it. Raises
-        `NotPermitted` where the thread uses no live permission."""
+        """Run the armed table, which opens the gates of lamps and projectors. Not repeated after a
+        lost reply: the table may run until `stop`. Raises `NotPermitted` without a live permission
+        of the calling thread."""
 
     def progress(self) -> TableProgress:
-        """Where the table is; feeds the box's watchdog."""
+        """The table's progress; feeds the box's watchdog."""
 
     def stop(self) -> int:
         """Close the gates at once and leave the table; returns the steps that were done. May be

@@ -38,7 +38,7 @@ class SerialTriggerBox:
         self.name = self._lines.name
 
     def connect(self) -> None:
-        """Open the port; raises `DeviceError` where no trigger box answers."""
+        """Open the port; raises `DeviceError` where no trigger box replies."""
         self.table_rows = int(self._lines.connect()[1] or 0)
 
     def close(self) -> None:
@@ -106,13 +106,13 @@ class SerialTriggerBox:
 
 
 def _joined(rows: Sequence[TableRow]) -> list[TableRow]:
-    """Neighbours alike as one row, as far as a row's `repeat` goes."""
+    """Consecutive equal rows as one, up to `MOST_REPEATS`."""
     out: list[TableRow] = []
     for row in rows:
         if row.repeat < 1:
             raise ValueError(f"a row is repeated 1 or more times, got {row.repeat}")
-    for row, alike in groupby(rows, lambda row: replace(row, repeat=1)):
-        left = sum(r.repeat for r in alike)
+    for row, equal in groupby(rows, lambda row: replace(row, repeat=1)):
+        left = sum(r.repeat for r in equal)
         while left > 0:
             out.append(replace(row, repeat=min(left, MOST_REPEATS)))
             left -= MOST_REPEATS

@@ -241,12 +241,12 @@ def test_more_lamps_than_a_universe_has_channels_are_refused(first, lamps):
 @pytest.mark.parametrize(
     ("registers", "lamps", "told"),
     [
-        ({}, 1001, "selector lies over levels at 1000"),
-        ({"levels": 900, "owner": "none"}, 331, "selector lies over levels at 1000"),
-        ({"heartbeat": 1002}, 331, "watchdog lies over heartbeat at 1002"),
-        ({"owner": 990}, 331, "owner lies over selector at 1000"),
-        ({"levels": 1990}, 331, "table lies over levels at 2000"),
-        ({"levels": 10_191}, 331, "table lies over levels at 10191"),  # the last of 4096 entries
+        ({}, 1001, "selector overlaps levels at 1000"),
+        ({"levels": 900, "owner": "none"}, 331, "selector overlaps levels at 1000"),
+        ({"heartbeat": 1002}, 331, "watchdog overlaps heartbeat at 1002"),
+        ({"owner": 990}, 331, "owner overlaps selector at 1000"),
+        ({"levels": 1990}, 331, "table overlaps levels at 2000"),
+        ({"levels": 10_191}, 331, "table overlaps levels at 10191"),  # the last of 4096 entries
     ],
 )
 def test_registers_that_lie_over_each_other_are_refused(registers, lamps, told):

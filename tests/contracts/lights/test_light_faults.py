@@ -20,13 +20,13 @@ LATE_S = 0.3  # the drivers' deadline is 0.2 s
 SELECT, STATUS, OFF = "6 1000", "4 0", "6 1003"
 
 TOLD = {
-    "silent": (DeviceTimeout, "expected an answer within {timeout} s, received nothing"),
-    "late": (DeviceTimeout, "expected an answer within {timeout} s, received nothing"),
+    "silent": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
+    "late": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
     "garbage": (DeviceTimeout, "within {timeout} s, received no answer in 10 bytes: 00 ff 68 73"),
     "crc": (DeviceTimeout, "within {timeout} s, received no answer in 8 bytes: 07 06 03 e8"),
     "nak": (DeviceError, r"expected an answer, received Modbus exception 4 \(refused now\)"),
     "echo": (DeviceError, "expected the answer function 6, 6 at 1000, received function 6, 7 at"),
-    "unplug": (DeviceUnreachable, "expected an answer within {timeout} s, received none"),
+    "unplug": (DeviceUnreachable, "expected a reply within {timeout} s, received none"),
 }
 # On TCP its header says at once that it is no answer.
 GARBAGE_ON_TCP = (DeviceError, "length 6, unit 1, received transaction 255, protocol 26739")

@@ -218,7 +218,11 @@ def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, 
 def test_lamps_that_stay_lit_are_unknown_and_unsafe(rig_file, world, tmp_path):
     events: list[Any] = []
     run = sequencer(rig_file, tmp_path / "c", events)
-    run._notify = lambda kind, data: setattr(world, "stuck_lamps", data.get("light") == LIGHTS[0])
+
+    def stick(_kind: str, data: dict[str, Any]) -> None:
+        world.stuck_lamps = world.stuck_lamps or data.get("light") == LIGHTS[0]
+
+    run._notify = stick
     world.lit = set()
     assert run.run() == "failed"
     assert run.blackout is not None

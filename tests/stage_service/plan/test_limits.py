@@ -216,7 +216,7 @@ def test_the_duty_counts_what_the_trigger_box_clocks(limited):
 
 def test_lamps_and_power_are_checked_before_anything_lights(limited):
     bank, lights, _ = limited(max_lamps=9)
-    with pytest.raises(SafetyRefusal, match=r"at most 9 lamps lit.*10 asked for"):
+    with pytest.raises(SafetyRefusal, match=r"at most 9 lamps lit.*10 requested"):
         lights.all_on()
     with pytest.raises(SafetyRefusal, match="entry 1 of a sequence"):
         lights.load_sequence([(0, 1.0), ("all", 0.1)])
