@@ -1,10 +1,9 @@
-"""Which pixels are hair and which are skin: the user's word, else the light, else geometry.
+"""Hair and skin pixels: from the user's masks, else from reflectance, else from geometry.
 
-Hair is wherever the user's mask says so, or else the user's network, of what is lit. Without one,
-what pixels look like tells them, in all cameras together, where they are two clear classes:
-`hair_features`. Where they are not, a pixel whose triangulated point stands off the head, or that
-shows the subject where the head is not, is an example of hair. Without a head mesh, gloss and the
-fineness of lines are split by themselves.
+Without user masks the pixels of all cameras are classified together by reflectance
+(`hair_features`) if they form two separate clusters. If they do not, pixels whose triangulated
+point lies off the head, and subject pixels outside the head's outline, are examples of hair.
+Without a head the whole subject then counts as hair.
 """
 
 from __future__ import annotations
@@ -24,24 +23,17 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import depth_map, mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.hair_features import (
-    FAINTEST_LINES,
     TwoClasses,
     clear_classes,
-    line_strength,
     looks,
-    split,
-    tell_apart,
     two_classes,
 )
-from reconstruction.images.segmentation import Network
-from reconstruction.images.silhouettes import NoSilhouette, lit_image, lit_rgb, silhouette
+from reconstruction.images.silhouettes import NoSilhouette, silhouette
 from reconstruction.images.visual_hull import trim_edges, visual_hull
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Stage
 
-Source = Literal[
-    "user", "network", "geometry", "geometry alone", "light and lines", "lines", "silhouette"
-]
+Source = Literal["user", "geometry", "geometry alone", "reflectance", "silhouette"]
 
 STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
 OUTLINE = 2e-3  # metres, and a pixel at least, about a head's outline that may be the head's
@@ -98,8 +90,6 @@ def hair_masks(
     capture: Capture,
     points: PointCloud | None = None,
     head: Mesh | None = None,
-    *,
-    network: Network | None = None,
 ) -> dict[str, HairMask]:
     """Masks of every camera that has a user's mask or a silhouette.
 
@@ -120,18 +110,14 @@ def hair_masks(
             subject = user
         if user is not None:
             masks[camera.name] = HairMask(subject | user, user, subject & ~user, "user", 1.0)
-        elif network is not None:
-            hair = network.hair_pixels(lit_rgb(capture, camera.name)) & subject
-            masks[camera.name] = HairMask(subject, hair, subject & ~hair, "network", 1.0)
         elif not subject.any():
             masks[camera.name] = HairMask(subject, subject, subject, "silhouette", 0.0)
         else:
             views.append(_View.of(capture, camera, subject, geometry))
-    masks |= _by_looks(capture, [v for v in views if v.looks is not None], geometry)
-    left = [v for v in views if v.camera.name not in masks]
-    if head is not None:
-        return masks | {v.camera.name: v.by_points() for v in left}
-    return masks | _by_lines(capture, left)
+    masks |= _by_looks([v for v in views if v.looks is not None], geometry)
+    for view in (v for v in views if v.camera.name not in masks):
+        masks[view.camera.name] = view.whole() if head is None else view.by_points()
+    return masks
 
 
 def usable_masks(
@@ -264,6 +250,10 @@ class _View:
         hair = hair & self.subject
         return HairMask(self.subject, hair, self.subject & ~hair, source, decided)
 
+    def whole(self) -> HairMask:
+        """The mask in which the whole subject is hair."""
+        return self.mask(self.subject, "silhouette", 0.0)
+
     def by_points(self) -> HairMask:
         """The mask by geometry alone: what has no point follows its neighbours."""
         hair = self.outside | self.standing
@@ -275,7 +265,7 @@ class _View:
         return self.mask(_fill(self.subject, hair, skin), source, decided)
 
 
-def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
+def _by_looks(views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
     """Masks of `views` with looks; none where these show one class and geometry knows no hair.
 
     The classes are learned from all cameras together. What a place looks like from all of them
@@ -287,22 +277,11 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
     hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
     if hair.any():
         classes: TwoClasses | None = two_classes(pixels, hair)
-    elif (classes := clear_classes(pixels)) is None:
-        subjects = {v.camera.name: v.subject for v in views}
-        glossy = {
-            v.camera.name: np.stack(
-                [v.image(v.seen[0]), line_strength(lit_image(capture, v.camera.name), v.subject)]
-            )
-            for v in views
-        }
-        start = tell_apart(glossy, subjects)
-        if start is None:
-            return {}
-        skin = np.concatenate([start[v.camera.name][v.subject] <= 0 for v in views])
-        classes = split(pixels, hair, skin)
+    else:
+        classes = clear_classes(pixels)
     if classes is None:
         return {}
-    source: Source = "light and lines" if geometry.head is None else "geometry"
+    source: Source = "reflectance" if geometry.head is None else "geometry"
     if not classes.weights.any():
         source = "geometry alone"
     scores = [v.image(classes.scores(v.seen)) + v.standing for v in views]
@@ -314,28 +293,6 @@ def _by_looks(capture: Capture, views: list[_View], geometry: _Geometry) -> dict
         total = np.where(view.outside, 6.0, score + 0.5 * place) * view.subject
         smooth = ndimage.gaussian_filter(total, 0.5) / np.maximum(near, 1e-9)
         out[view.camera.name] = view.mask(smooth > 0, source, 1.0)
-    return out
-
-
-def _by_lines(capture: Capture, views: list[_View]) -> dict[str, HairMask]:
-    """Masks from lines alone; where these show one class, all of it may be hair."""
-    subjects = {v.camera.name: v.subject for v in views}
-    lines = {
-        name: line_strength(lit_image(capture, name), subject)[None]
-        for name, subject in subjects.items()
-    }
-    scores = tell_apart(lines, subjects) if views else None
-    if scores is not None:
-        hairs = [lines[n][0][subject & (scores[n] > 0)] for n, subject in subjects.items()]
-        if np.median(np.concatenate(hairs)) < FAINTEST_LINES:
-            scores = None  # what stands out is an outline, or noise
-    if scores is None:
-        return {v.camera.name: v.mask(v.subject, "silhouette", 0.0) for v in views}
-    out = {}
-    for view in views:
-        hair = view.subject & (scores[view.camera.name] > 0)
-        hair = _fill(view.subject, hair, view.subject & ~hair)
-        out[view.camera.name] = view.mask(hair, "lines", 1.0)
     return out
 
 

@@ -35,7 +35,6 @@ from reconstruction.head.capture_head import FittedHead
 from reconstruction.head.heads import Heads
 from reconstruction.head.scalp import Scalp, find_scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
-from reconstruction.images.segmentation import Network
 from reconstruction.light_codes.line_strands import (
     SEGMENT_WEIGHT,
     line_strands,
@@ -233,13 +232,9 @@ class _Stages:
 
         A held-out camera's mask says where to compare pictures; nothing here looks at it.
         """
-        asked = self.options.network
-        network = None if asked is None else Network(asked)
         with self.report.stage("masks") as stage:
             mesh = None if head is None else head.mesh
-            every = hair_masks(whole, cloud if len(cloud) else None, mesh, network=network)
-            if network is not None:
-                stage.figures["network"] = network.to_dict()
+            every = hair_masks(whole, cloud if len(cloud) else None, mesh)
             for name, mask in every.items():
                 self.model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
                 self.model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))

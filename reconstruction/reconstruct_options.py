@@ -30,23 +30,6 @@ class LogGaborBank:
 
 
 @options
-class NetworkOptions:
-    """A network from a picture `(1, 3, h, w)` to scores `(1, C, h', w')` of C classes.
-
-    It gets RGB in sRGB, exposed so that the 99th percentile is white, as (value - `mean`) / `std`
-    with values in [0, 1], scaled to `size` (width, height); None leaves the camera's own. Of
-    several classes number `hair` must win; one class is hair where its score, a probability in
-    [0, 1] or else a logit, says more than even.
-    """
-
-    file: str
-    size: tuple[Count, Count] | None = None
-    hair: Annotated[int, Field(ge=0)] = 1
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    std: tuple[Length, Length, Length] = (1.0, 1.0, 1.0)
-
-
-@options
 class MotionOptions:
     """How the motion is solved, and what the subject does `between` two tracking frames."""
 
@@ -124,12 +107,12 @@ class ReconstructOptions:
 
     `held_out` cameras take no part at all. `grid` is the voxels' edge; `roots` strands are grown
     from the scalp, then gaps are filled. `max_length` is the hair's, which the user knows. `margin`
-    is how far in front of the seen surface the envelope reaches. `network` tells hair from skin
-    where the user's masks do not. `scalp_points` is a file of digitised points of the scalp to fit
-    a head to, where the capture has no `head.obj` or a better one is wanted, and `head_mesh` (OBJ)
-    the head to fit instead of the generic one. Gaps are filled `within` metres of what was measured
-    (None: 3 mm, or two voxels, of a hull 12 mm): give more where pixels are wider. `radius` of the
-    strands; None takes the one that keeps a head of hair's coverage.
+    is how far in front of the seen surface the envelope reaches. `scalp_points` is a file of
+    digitised scalp points to fit a head to, where the capture has no `head.obj` or a better one is
+    wanted, and `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled
+    `within` metres of what was measured (None: 3 mm, or two voxels, of a hull 12 mm): give more
+    where pixels are wider. `radius` of the strands; None takes the one that keeps a head of hair's
+    coverage.
     """
 
     held_out: tuple[str, ...] = ()
@@ -137,7 +120,6 @@ class ReconstructOptions:
     roots: Annotated[int, Field(ge=1, le=1_000_000)] = 8000
     max_length: Length = 0.3
     margin: Factor = 2e-3
-    network: NetworkOptions | None = None
     scalp_points: str | None = None
     head_mesh: str | None = None
     within: Length | None = None

@@ -82,7 +82,6 @@ def check_named(pipeline: PipelineRequest, rig: Rig) -> None:
         ("environment", None if options.environment in PROCEDURAL else options.environment),
         ("reconstruct.head_mesh", asked.head_mesh),
         ("reconstruct.scalp_points", asked.scalp_points),
-        ("reconstruct.network.file", asked.network.file if asked.network else None),
     ):
         try:
             if file is not None and not (field == "truth" and Path(file).is_dir()):

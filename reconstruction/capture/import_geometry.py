@@ -49,7 +49,7 @@ class GeometryFiles:
 
 
 CAMERA_FILES = ("sparse/0", "sparse", "transforms.json", "cameras.xml")
-LIGHT_FILES = ("lights.csv", "lights.txt", "light_pos.npy")
+LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
 
 
 def files_in(folder: Path, said: GeometryFiles) -> GeometryFiles:

@@ -1,9 +1,8 @@
 """Layouts of public OLAT sets: which file is which frame, and where cameras and lights stand.
 
-FaceOLAT (github.com/prraoo/FaceOLAT), HumanOLAT (github.com/TMT22/HumanOLAT) and OpenIllumination
-(github.com/oppo-us-research/OpenIlluminationCapture), as their pages and tools describe them; no
-real set was at hand. In the first two the whole stage lights up between single lights, so that the
-subject can be tracked; which frames these are differs between takes, by one or more.
+FaceOLAT (github.com/prraoo/FaceOLAT) and HumanOLAT (github.com/TMT22/HumanOLAT), as their pages and
+tools describe them; tested on imitations only. All lights are on between single lights, so that
+the subject can be tracked; the numbers of these frames differ between takes by one or more.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from reconstruction.capture.import_settings import Found, ImportSettings
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with_fully_lit
 from reconstruction.containment import plain_file
 from reconstruction.files.cameras import CameraFile, read_cameras
-from reconstruction.files.cameras.nerfstudio import read_transforms
 from reconstruction.files.lights import LightFile, read_lights
 from reconstruction.files.pictures import Sensor, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
@@ -37,7 +35,7 @@ from reconstruction.geometry.placement import (
 )
 from reconstruction.reading import read_json
 
-Preset = Literal["faceolat", "humanolat", "openillumination"]
+Preset = Literal["faceolat", "humanolat"]
 HATCH = (
     *(178, 179, 208, 209, 210, 237, 238, 239, 240, 267, 268, 269, 270, 271),
     *(295, 296, 297, 298, 319, 320, 321),
@@ -94,9 +92,7 @@ def read_preset(
     """
     if not files.folder.is_dir():
         raise PresetProblem(f"{files.folder}: no such folder")
-    return {"faceolat": _faceolat, "humanolat": _humanolat, "openillumination": _openillumination}[
-        preset
-    ](files, mean, given)
+    return {"faceolat": _faceolat, "humanolat": _humanolat}[preset](files, mean, given)
 
 
 def understood(take: Take) -> tuple[ImportSettings, Found]:
@@ -188,74 +184,6 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
         {c: p for c, p in masks.items() if p.is_file()},
         "srgb" if pictures.name == "images_processed" else "linear",
     )
-
-
-def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
-    """An object: `Lights/NNN/raw_undistorted/CAMERA.JPG`, `output/transforms_*.json`, and
-    `--lights light_pos.npy`; poses have OpenCV's axes and a unit of their own.
-    """
-    folder = files.folder
-    by_light = {p.name: p / "raw_undistorted" for p in sorted((folder / "Lights").glob("*"))}
-    if not by_light or not all(p.is_dir() for p in by_light.values()):
-        raise PresetProblem(f"{folder}: expected Lights/000/raw_undistorted/CAMERA.JPG and so on")
-    lights = read_lights(_given(files.lights, "--lights light_pos.npy"))
-    if len(by_light) == 13 and len(lights.lights) > 13:
-        raise PresetProblem(
-            f"{folder}: the 13 patterns of many lights; take the object's OLAT pictures instead"
-        )
-    if not (by_light.keys() <= {f"{i:03d}" for i in range(len(lights.lights) + 1)}):
-        raise PresetProblem(f"{folder}: Lights has folders that are no light's number: 000, 001, …")
-    shape = _first_shape(by_light)
-    read: list[CameraFile] = []
-    for path in sorted((folder / "output").glob("transforms_*.json")):
-        read.append(read_transforms(path, _calibrated(path, read_json(path), shape)))
-    cameras = {c.name: c for file in read for c in file.cameras}
-    if not cameras:
-        raise PresetProblem(f"{folder}: expected output/transforms_train.json and _test.json")
-    where = replace(PlacementOptions(camera_axes="opencv"), **given)
-    file = CameraFile(
-        list(cameras.values()),
-        ["cameras and lights are given with the cameras 1 away: give --unit with that in metres"],
-        axes="opengl",
-    )
-    geometry = _placed(file, lights, where)
-    frames = []
-    absent = []
-    for number, place in by_light.items():
-        for path in sorted(p for p in place.iterdir() if p.is_file()):
-            if path.stem in cameras and int(number) < len(geometry.lights):
-                light = geometry.lights[int(number)].name
-                frames.append(TakeFrame("olat", int(number), path.stem, path, light))
-            elif path.stem not in cameras and path.stem not in absent:
-                absent.append(path.stem)
-    notes = [*geometry.notes]
-    if absent:
-        notes.append(f"no pose for {', '.join(absent)}: left out")
-    masks = {c: folder / "output" / "com_masks" / f"{c}.png" for c in cameras}
-    return Take(
-        replace(geometry, notes=notes), frames, {c: p for c, p in masks.items() if p.is_file()}
-    )
-
-
-def _calibrated(path: Path, data: Any, shape: tuple[int, int]) -> dict[str, Any]:
-    """Frames with a size: that of the calibration, which may differ from the pictures' own."""
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
-        raise PresetProblem(f"{path}: expected an object of frames by camera")
-    frames = {}
-    for name, frame in data["frames"].items():
-        wide = frame.get("calib_imgw") if isinstance(frame, dict) else None
-        if not isinstance(wide, int) or wide < 1:
-            raise PresetProblem(f"{path}: frames.{name}.calib_imgw: expected pixels, got {wide!r}")
-        frames[name] = {**frame, "w": wide, "h": round(wide * shape[1] / shape[0])}
-    return {"frames": frames}
-
-
-def _first_shape(by_light: Mapping[str, Path]) -> tuple[int, int]:
-    """Width and height of the first picture."""
-    for place in by_light.values():
-        for path in sorted(p for p in place.iterdir() if p.is_file()):
-            return picture_size(path)
-    raise PresetProblem(f"{next(iter(by_light.values()))}: has no picture")
 
 
 def _given(path: Path | None, example: str) -> Path:

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Array, Ints
+from reconstruction.arrays import Array
 from reconstruction.evaluation.baselines import with_true_directions
 from reconstruction.evaluation.connectivity import spread
-from reconstruction.evaluation.matching import StrandComparison, compare_strands, scores
+from reconstruction.evaluation.matching import StrandComparison, compare_strands
 from reconstruction.evaluation.oriented_points import Block, Drawn
-from reconstruction.evaluation.regions import DEPTHS, SCALP, HairDepth, HeadSphere
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.closest_point import ClosestPoint
@@ -30,8 +29,7 @@ OTHER_UNITS = 10.0  # sizes that differ by this factor are hardly those of one h
 class Nearest:
     """The nearest point of the other set to each of the `drawn (N,)` points.
 
-    `distance (N,)` in metres, `cosine (N,)` between the tangents, `strand (N,)` that it lies on;
-    infinite, 0 and -1 where nothing was shown.
+    `distance (N,)` in metres, `cosine (N,)` between the tangents; infinite and 0 before `look`.
     """
 
     def __init__(self, drawn: Drawn) -> None:
@@ -39,7 +37,6 @@ class Nearest:
         self.drawn = drawn
         self.distance = np.full(count, np.inf)
         self.cosine = np.zeros(count)
-        self.strand = np.full(count, -1)
 
     def look(self, block: Block) -> None:
         """Keep the points of `block` that are nearer than those so far."""
@@ -48,7 +45,6 @@ class Nearest:
         j = j[closer]
         self.distance[closer] = distance[closer]
         self.cosine[closer] = (self.drawn.tangents[closer] * block.tangents[j]).sum(axis=1)
-        self.strand[closer] = block.strand[j]
 
     @property
     def angle_deg(self) -> Array:
@@ -71,7 +67,6 @@ class Assessment:
     figures: dict[str, Any]
     pred: Nearest
     true: Nearest
-    lengths_mm: tuple[Array, Array]
 
 
 def assess_strands(
@@ -93,9 +88,6 @@ def assess_strands(
     - `roots.{pred,true}`: the share of strands whose root is within 5 mm of the scalp (`rooted`)
       and of those whose tip is and the root is not (`upside_down`). The scalp is what the head
       marks as such, or else the true roots (`roots.scalp` says which);
-    - `regions.scalp` and `regions.depth`: precision, recall and F of the parts of the hair. A true
-      point belongs to where its strand grows from, a predicted one to where its nearest true one
-      does. The hair that lies 5 mm and more below the hair's surface is `inner`;
     - `true_directions`, where `cameras` are given: what `true_direction_figures` returns;
     - `warnings`: sentences about what looks wrong with the input.
 
@@ -110,11 +102,6 @@ def assess_strands(
     progress("true points among the predicted ones", 0.3)
     comparison.look_at_prediction(of_true)
     warnings = input_warnings(pred, true)
-    sphere = HeadSphere.of(true)
-    if sphere is None:
-        warnings.append("the true roots do not lie on a head: there are no figures by scalp region")
-    progress("parts of the hair", 0.6)
-    regions = _region_figures(comparison, of_pred, head, sphere)
     figures = comparison.figures()
     if cameras is not None:
         progress("with the true directions over a pixel", 0.7)
@@ -124,11 +111,10 @@ def assess_strands(
     figures |= {
         "errors": {"pred": of_pred.figures(), "true": of_true.figures()} if len(pred) else {},
         "roots": root_figures(pred, true, head),
-        "regions": regions,
         "warnings": warnings,
     }
     progress("judged", 1.0)
-    return Assessment(figures, of_pred, of_true, (1e3 * pred.lengths(), 1e3 * true.lengths()))
+    return Assessment(figures, of_pred, of_true)
 
 
 def true_direction_figures(
@@ -204,30 +190,3 @@ def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict
         root, tip = (d <= ROOTED for d in distance)
         out[name] = {"rooted": float(root.mean()), "upside_down": float((tip & ~root).mean())}
     return out
-
-
-def _region_figures(
-    comparison: StrandComparison,
-    of_pred: Nearest,
-    head: Mesh | None,
-    sphere: HeadSphere | None,
-) -> dict[str, Any]:
-    precision, recall = comparison.all
-    depth = HairDepth(comparison.truth, head if head is not None else sphere)
-    kinds: dict[str, tuple[Sequence[str], Ints, Ints]] = {}
-    if sphere is not None:
-        grows = sphere.scalp_regions(comparison.true.roots)
-        kinds["scalp"] = SCALP, grows[of_pred.strand], grows[recall.drawn.strand]
-    mine, theirs = (depth.regions(matches.drawn.points) for matches in (precision, recall))
-    kinds["depth"] = DEPTHS, mine, theirs
-    return {
-        kind: {
-            name: {
-                **scores(precision, recall, predicted=mine == k, true=theirs == k),
-                "points": {"pred": int((mine == k).sum()), "true": int((theirs == k).sum())},
-            }
-            for k, name in enumerate(names)
-            if (theirs == k).any()
-        }
-        for kind, (names, mine, theirs) in kinds.items()
-    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -89,42 +88,16 @@ class Followed:
     def covered(self) -> Array:
         """The share of each followed strand that lies on any other strand `(N,)`."""
         on_any = np.zeros(len(self._block.points))
-        on_any[np.concatenate([*self._point, np.zeros(0, np.int64)])] = 1.0
+        for points in self._point:
+            on_any[points] = 1.0
         starts = np.cumsum(self._counts) - self._counts
         return np.asarray(np.add.reduceat(on_any, starts) / self._counts)
 
-    def covering(self) -> Array:
-        """How many other strands lie along each followed strand, if only at a point `(N,)`."""
-        which, _, _ = self._pairs()
-        return np.bincount(which, minlength=len(self.strands)).astype(float)
-
-    def fragments(self) -> Array:
-        """How few other strands cover what of each followed one is covered `(N,)`, 0 for nothing.
-
-        Always the one next that covers most of what is left.
-        """
-        point, other = self._incidences()
-        owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]
-        ends = np.searchsorted(owner, np.arange(len(self.strands) + 1))
-        out = np.zeros(len(self.strands))
-        for k, (a, b) in enumerate(pairwise(ends)):
-            left, (_, by) = point[a:b], np.unique(other[a:b], return_inverse=True)
-            while len(left):
-                best = left[by == np.bincount(by).argmax()]
-                keep = ~np.isin(left, best)
-                left, by = left[keep], by[keep]
-                out[k] += 1
-        return out
-
-    def _incidences(self) -> tuple[Ints, Ints]:
-        """Points of the followed strands and strands that they lie on, by point."""
-        point = np.concatenate([*self._point, np.zeros(0, np.int64)])
-        order = np.argsort(point, kind="stable")
-        return point[order], np.concatenate([*self._other, np.zeros(0, np.int64)])[order]
-
     def _pairs(self) -> tuple[Ints, Ints, Ints]:
         """Followed strand (its place), other strand, and how many points of the first lie on it."""
-        point, other = self._incidences()
+        point, other = (
+            np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (self._point, self._other)
+        )
         owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]
         width = int(other.max(initial=0)) + 1
         pair, count = np.unique(owner * width + other, return_counts=True)
@@ -136,16 +109,12 @@ def connectivity_figures(pred: Followed | None, true: Followed) -> dict[str, Any
 
     `pred.on_one`: the largest share of a predicted strand that lies on one true strand: 1 for one
     that never changes hairs. `true.by_one`: the largest share of a true strand that one predicted
-    strand covers; `true.covered`: that all of them cover together; `true.covering`: how many lie
-    along it; `true.fragments`: how few of them are enough, over the true strands that are covered
-    at all. Each with mean, percentiles and the mean's standard error.
+    strand covers; `true.covered`: that all of them cover together. Each with mean, percentiles and
+    the mean's standard error.
     """
     out: dict[str, Any] = {"lies_on": LIES_ON.name, "true": {"followed": len(true.strands)}}
-    fragments = true.fragments()
-    figures = {"by_one": true.shares(), "covered": true.covered(), "covering": true.covering()}
-    for name, values in {**figures, "fragments": fragments[fragments > 0]}.items():
-        if len(values):
-            out["true"][name] = _spread_and_error(values, true.complete)
+    for name, values in (("by_one", true.shares()), ("covered", true.covered())):
+        out["true"][name] = _spread_and_error(values, true.complete)
     if pred is not None:
         on_one = _spread_and_error(pred.shares(), pred.complete)
         out["pred"] = {"followed": len(pred.strands), "on_one": on_one}

@@ -50,16 +50,15 @@ def scores(
     *,
     directed: bool = False,
     predicted: Bools | None = None,
-    true: Bools | None = None,
 ) -> dict[str, dict[str, float]]:
     """Precision, recall and F at each threshold, as `compare_strands` returns them.
 
-    With `predicted (N,)` and `true (m,)` only of those of the drawn points.
+    With `predicted (N,)`, precision counts only these of the drawn predicted points.
     """
     out = {}
     for k, threshold in enumerate(THRESHOLDS):
         p, dp = _share(precision, k, directed, predicted)
-        r, dr = _share(recall, k, directed, true)
+        r, dr = _share(recall, k, directed, None)
         f = 2 * p * r / (p + r) if p + r > 0 else 0.0
         errors = {"precision_error": dp, "recall_error": dr}
         out[threshold.name] = {"precision": p, "recall": r, "f": f, **errors}

@@ -1,8 +1,7 @@
-"""Pictures of a report: where the time went, error against run time, what was left out."""
+"""Plots of a report: time per stage, error against run time, scores of strands."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from reconstruction.files.durable import writing
 from reconstruction.report.report import Report, Series, Stage
@@ -24,9 +22,8 @@ WIDTH = 9.0
 def plot_report(report: Report, folder: str | Path) -> list[Path]:
     """Draw what the report holds into PNGs in `folder` and return their paths.
 
-    `seconds.png` (time per stage), `error_<stage>.png` for each stage that recorded error against
-    run time, `left_out.png` (work that was not done, why, and what that saved; warnings below).
-    What the report does not hold gives no picture.
+    `seconds.png` (time per stage) and `error_<stage>.png` for each stage that recorded error
+    against run time.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -38,8 +35,6 @@ def plot_report(report: Report, folder: str | Path) -> list[Path]:
         if drawn:
             slug = "".join(c if c.isalnum() else "_" for c in stage.name.lower())
             figures[f"error_{slug}"] = _errors(stage.name, drawn)
-    if any(stage.left_out or stage.warnings for stage in report.stages):
-        figures["left_out"] = _left_out(report.stages)
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
 
@@ -133,46 +128,6 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
         axes.remove()
     title = f"{_words(stage)}: error against run time"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, **_BOLD)
-    return figure
-
-
-def _left_out(stages: Sequence[Stage]) -> Figure:
-    """A table set as text: its height is that of its lines."""
-    widths, starts = (30, 48, 32), (0.14, 0.42, 0.76)
-    rows: list[tuple[str, list[list[str]], bool]] = []
-    for stage in stages:
-        name = _words(stage.name)
-        for item in stage.left_out:
-            texts = (item.what, item.why, item.saved)
-            wrapped = [textwrap.wrap(t, w) for t, w in zip(texts, widths, strict=True)]
-            rows.append((name, wrapped, False))
-        rows += [(name, [textwrap.wrap(warning, 112)], True) for warning in stage.warnings]
-    line, gap = 0.175, 0.14  # inches
-    shown = [
-        [] if i and rows[i - 1][0] == name else textwrap.wrap(name, 16)
-        for i, (name, _, _) in enumerate(rows)
-    ]
-    lines = (max(len(a), *map(len, cells)) for a, (_, cells, _) in zip(shown, rows, strict=True))
-    heights = [gap + line * n for n in lines]
-    total = 0.85 + sum(heights)
-    figure = Figure(figsize=(WIDTH + 2, total))
-
-    def write(x: float, y: float, lines: Sequence[str], **style: Any) -> None:
-        for k, text in enumerate(lines):
-            figure.text(x, y - k * line / total, text, va="baseline", **style)
-
-    write(0.015, 1 - 0.28 / total, ["Left out, and warnings"], fontsize=11, **_BOLD)
-    for x, head in zip((0.015, *starts), ("stage", "left out", "why", "saved"), strict=True):
-        write(x, 1 - 0.6 / total, [head], fontsize=8.5, color=QUIET)
-    y = 1 - 0.7 / total
-    for first, (_, cells, is_warning), height in zip(shown, rows, heights, strict=True):
-        colour = QUIET if first else FAINT
-        figure.add_artist(Line2D([0.015, 0.985], [y, y], color=colour, linewidth=0.8))
-        base = y - (0.5 * gap + 0.78 * line) / total
-        write(0.015, base, first, fontsize=8.5, **_BOLD)
-        for x, cell in zip(starts, cells, strict=False):
-            write(x, base, cell, fontsize=8.5, color=COLOURS[1] if is_warning else INK)
-        y -= height / total
     return figure
 
 

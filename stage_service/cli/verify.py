@@ -61,7 +61,7 @@ def add(commands: Commands) -> None:
         choices=("opencv", "opengl"),
         help="if they differ from those of the format of --cameras",
     )
-    presets = ("faceolat", "humanolat", "openillumination")
+    presets = ("faceolat", "humanolat")
     imported.add_argument("--preset", choices=presets, help="layout of this published data set")
     imported.add_argument("--take", help="of --preset faceolat: ID20001")
 

@@ -9,17 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from reconstruction import Camera, Capture, CaptureWriter, Light, Mesh, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import (
     clear_classes,
-    line_strength,
     matte_fit,
-    otsu,
-    tell_apart,
     two_classes,
 )
 from reconstruction.images.silhouettes import (
@@ -174,11 +170,11 @@ def test_a_blown_all_on_frame_is_not_what_lines_are_read_from(tmp_path: Path) ->
         np.testing.assert_allclose(found, (2 if name == "blown" else 4) * truth, rtol=1e-5)
 
 
-def test_light_and_lines_tell_fibres_from_skin(hairy_capture: Capture) -> None:
+def test_reflectance_separates_fibres_from_skin(hairy_capture: Capture) -> None:
     masks = hair_masks(hairy_capture)
     for device in hairy_capture.rig.cameras:
         mask = masks[device.name]
-        assert mask.source == "light and lines"
+        assert mask.source == "reflectance"
         assert iou(mask.hair, upper(device)[1]) > 0.9
         assert not (mask.hair & mask.skin).any()
         assert np.array_equal(mask.hair | mask.skin, mask.subject)
@@ -354,7 +350,7 @@ def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Ca
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     (said,) = stage.warnings
     assert "not be told from skin in right: all of the subject" in said
-    masks["right"] = replace(masks["right"], source="network")
+    masks["right"] = replace(masks["right"], source="geometry")
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     assert stage.warnings == []
 
@@ -460,60 +456,6 @@ def test_hair_at_the_outline_that_shines_more_does_not_make_the_rest_skin() -> N
     scores = two_classes(np.concatenate([rim, inner, skin]), np.arange(8880) < 2400).scores
     assert (scores(inner.T) > 0).mean() > 0.97
     assert (scores(skin.T) < 0).mean() > 0.97
-
-
-def fur(shape: tuple[int, int], hair: np.ndarray, seed: int, noise: float = 0.01) -> np.ndarray:
-    """A lit picture: smooth shading with a nose's edge, and lines two pixels wide where hair is."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    skin = 1 + 0.5 * np.sin(x / 20) + 0.3 * (y > 70)
-    lines = ndimage.gaussian_filter(rng.normal(size=shape), (6.0, 0.8))
-    lines = 1 + 0.4 * lines / lines.std()
-    return np.where(hair, 0.4 * np.maximum(lines, 0), skin) + noise * rng.normal(size=shape)
-
-
-def test_lines_alone_tell_hair_in_views_of_the_face_and_of_the_back() -> None:
-    subject = np.zeros((120, 120), bool)
-    subject[8:112, 8:112] = True
-    y, _ = np.mgrid[:120, :120]
-    truth = {"face": y < 50, "back": y < 200, "nape": y < 100}
-    subjects = dict.fromkeys(truth, subject)
-    features = {
-        name: line_strength(fur((120, 120), hair, k), subject)[None]
-        for k, (name, hair) in enumerate(truth.items())
-    }
-    scores = tell_apart(features, subjects)
-    assert scores is not None
-    for name, hair in truth.items():
-        assert iou(subject & (scores[name] > 0), subject & hair) > 0.8  # edges answer, too
-        assert not scores[name][~subject].any()
-
-
-def test_a_feature_that_says_nothing_does_not_count() -> None:
-    rng = np.random.default_rng(0)
-    hair = np.arange(6400).reshape(80, 80) < 4000
-    good = np.where(hair, 1.0, 0.0) + 0.1 * rng.normal(size=hair.shape)
-    whole = {"c": np.ones_like(hair)}
-    for other in (0.1 * rng.normal(size=hair.shape), np.zeros(hair.shape)):
-        scores = tell_apart({"c": np.stack([good, other])}, whole)
-        assert scores is not None
-        assert iou(scores["c"] > 0, hair) > 0.98
-
-
-def test_one_class_is_not_split() -> None:
-    rng = np.random.default_rng(1)
-    whole = {"c": np.ones((90, 90), bool)}
-    assert tell_apart({"c": rng.normal(size=(2, 90, 90))}, whole) is None
-    assert tell_apart({"c": np.zeros((2, 90, 90))}, whole) is None
-    assert tell_apart({"c": np.zeros((2, 90, 90))}, {"c": np.zeros((90, 90), bool)}) is None
-    values = rng.normal(size=10_000)
-    assert otsu(values)[0] == pytest.approx(0, abs=0.05)
-    assert otsu(values)[1] == pytest.approx(2.65, abs=0.05)
-    level, apart = otsu(np.r_[values, 8 + values])
-    assert 2 < level < 5
-    assert apart == pytest.approx(8, abs=0.2)
-    assert otsu(np.r_[np.zeros(50), np.ones(50)])[0] == 0
-    assert otsu(np.ones(5)) == (np.inf, 0.0)
 
 
 @pytest.mark.parametrize("size", [64, 400])

@@ -16,13 +16,11 @@ from reconstruction.reconstruct_options import LogGaborBank
 def test_nested_json_fills_in_the_defaults() -> None:
     made = parse_options(
         ReconstructOptions,
-        {"held_out": ["c1"], "measure": {"bank": {"wavelength": 4}}, "network": {"file": "a.onnx"}},
+        {"held_out": ["c1"], "measure": {"bank": {"wavelength": 4}}},
     )
     assert made.held_out == ("c1",)
     assert made.measure.bank.wavelength == 4.0
     assert made.measure.thin == ReconstructOptions().measure.thin
-    assert made.network is not None
-    assert made.network.size is None
 
 
 def test_what_is_given_by_position_is_named_by_its_field() -> None:
@@ -43,8 +41,6 @@ def test_what_is_given_by_position_is_named_by_its_field() -> None:
         ({"roots": 2.5}, "roots"),
         ({"gird": 1e-3}, "gird"),
         ({"seed": -1}, "seed"),
-        ({"network": {}}, "network.file"),
-        ({"network": {"file": "a.onnx", "std": [1, 1, 0]}}, "network.std.2"),
         ({"measure": {"thin": 0}}, "measure.thin"),
         ({"measure": {"bank": {"wavelength": 1}}}, "measure.bank.wavelength"),
         ({"light_codes": {"search": {"neighbours": 32}}}, "light_codes.search.neighbours"),

@@ -91,13 +91,11 @@ def picture(path: Path) -> np.ndarray:
 
 def test_plots(report: Report, tmp_path: Path) -> None:
     files = plot_report(report, tmp_path / "plots")
-    assert [f.name for f in files] == ["seconds.png", "error_field.png", "left_out.png"]
+    assert [f.name for f in files] == ["seconds.png", "error_field.png"]
     for file in files:
         image = picture(file)
         assert image.shape[1] > 900
         assert 0.003 < (image.min(axis=2) < 128).mean() < 0.5
-    report["field"].warnings += ["word " * 60] * 3
-    assert picture(plot_report(report, tmp_path)[2]).shape[0] > 1.3 * image.shape[0]
 
 
 def test_plots_of_little(tmp_path: Path) -> None:

@@ -37,8 +37,6 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
     Raises `CameraFileError` naming the frame and the field.
     """
     frames = data["frames"]
-    if isinstance(frames, dict):
-        frames = list(frames.values())
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise CameraFileError(f"{path}: frames: expected a list with at least one object")
     groups: dict[bytes, list[str]] = {}

@@ -33,7 +33,7 @@ def run_geometry(args: argparse.Namespace, output: Output) -> None:
 
     Compare two strand files (metres, z up, roots first) at 1 mm/10°, 2 mm/20° and 3 mm/30°: over
     all true points, and with --capture over the visible ones; with and without the direction from
-    root to tip; by region; with lengths and continuity. With --capture also the scores with the
+    root to tip; with lengths and continuity. With --capture also the scores with the
     true directions over a pixel.
     """
     from reconstruction import Capture, read_obj, read_strands

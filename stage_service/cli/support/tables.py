@@ -54,10 +54,6 @@ def _cells(scores: dict[str, dict[str, float]]) -> list[str]:
 
 def assessment_text(figures: dict[str, Any]) -> Group:
     """Tables of what `assess_strands` found."""
-    regions = Table("part of the hair", *_HEADS, title="Precision / recall / F by part, %")
-    for kind in figures["regions"].values():
-        for name, scores in kind.items():
-            regions.add_row(name, *_cells(scores))
     more = Table("", "predicted", "true", title="Strands")
     for name, value in _STRAND_ROWS:
         cells = [value(figures, which) for which in ("pred", "true")]
@@ -67,7 +63,7 @@ def assessment_text(figures: dict[str, Any]) -> Group:
     if "true_directions" in figures:
         rows["true directions"] = figures["true_directions"]
     table = geometry_table(rows)
-    return Group(table, regions, more)
+    return Group(table, more)
 
 
 def _spread(figures: dict[str, Any], *path: str) -> str:
@@ -93,8 +89,6 @@ _STRAND_ROWS: list[tuple[str, Callable[[dict[str, Any], str], str]]] = [
     ("angle to it, degrees", lambda f, w: _spread(f, "errors", w, "angle_deg")),
     ("nearest point runs the other way, %", lambda f, w: _share(f, "errors", w, "reversed")),
     ("most of it on one strand, share", lambda f, w: _spread(f, "connectivity", w, _ONE[w])),
-    ("strands that lie along it", lambda f, w: _spread(f, "connectivity", w, "covering")),
-    ("fewest that cover what any does", lambda f, w: _spread(f, "connectivity", w, "fragments")),
     ("reach the scalp, %", lambda f, w: _share(f, "roots", w, "rooted")),
     ("with their tip, %", lambda f, w: _share(f, "roots", w, "upside_down")),
 ]

@@ -16,7 +16,6 @@ from reconstruction.capture.import_folder import Import
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, fully_lit
 from reconstruction.capture.presets import HATCH, PresetFiles, Take, read_preset, understood
 from reconstruction.geometry.lights import dome_positions
-from reconstruction.geometry.placement import PlacementError
 from stage_service.cli import main
 
 COUNT = 331
@@ -173,47 +172,6 @@ def test_humanolat(tmp_path: Path) -> None:
         take.geometry.cameras["Cam01"].center, np.add(place, [1, 0, 0]), atol=1e-6
     )
     assert take.response == "srgb"
-
-
-def test_openillumination(tmp_path: Path) -> None:
-    """Intrinsics for four times the pictures' size, poses in OpenCV's axes, lights in `.npy`."""
-    truth = []
-    for i, name in enumerate(["CA2", "CA4", "NA1"]):
-        a = 0.9 * i
-        position = [np.cos(a), np.sin(a), 0.4]
-        truth.append(Camera.look_at(name, 1200, 800, position, [0, 0, 0], 25))
-    folder = tmp_path / "obj_01_car"
-    for split, cameras in (("train", truth[:2]), ("test", truth[2:])):
-        frames = {}
-        for camera in cameras:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = camera.R.T, camera.center
-            angle = 2 * np.arctan(600 / camera.K[0, 0])
-            frames[camera.name] = {"file_path": f"./images/{camera.name}", "calib_imgw": 1200}
-            frames[camera.name] |= {"transform_matrix": pose.tolist(), "camera_angle_x": angle}
-        (folder / "output").mkdir(parents=True, exist_ok=True)
-        (folder / "output" / f"transforms_{split}.json").write_text(json.dumps({"frames": frames}))
-    for light in range(5):
-        place = folder / "Lights" / f"{light:03d}" / "raw_undistorted"
-        place.mkdir(parents=True)
-        for name in ("CA2", "CA4", "NA1", "CF7"):
-            cv2.imwrite(str(place / f"{name}.JPG"), np.full((200, 300, 3), 50, np.uint8))
-    np.save(tmp_path / "light_pos.npy", dome_positions(142, 1.02))
-    files = PresetFiles(folder, lights=tmp_path / "light_pos.npy")
-    take = read_preset("openillumination", files, mean, {"unit": 1.3})
-    assert Counter(f.light for f in take.frames) == {f"light_{i:03d}": 3 for i in range(5)}
-    assert any("no pose for CF7" in n for n in take.geometry.notes)
-    points = RNG.uniform(-0.1, 0.1, (20, 3))
-    for camera in truth:
-        found = take.geometry.cameras[camera.name]
-        assert (found.width, found.height) == (1200, 800)
-        np.testing.assert_allclose(
-            found.project(1.3 * points)[0], camera.project(points)[0], atol=1e-6
-        )
-    with pytest.raises(PlacementError, match="give --camera-axes opencv"):
-        read_preset("openillumination", files, mean, {"camera_axes": "opengl"})
-    with pytest.raises(PresetProblem, match="expected Lights/000"):
-        read_preset("openillumination", PresetFiles(tmp_path, lights=files.lights), mean)
 
 
 def test_the_command_imports_a_take_of_avif(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

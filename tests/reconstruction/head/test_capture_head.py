@@ -81,7 +81,7 @@ def cloud_of(capture: Capture, turn_deg: float = 0.0) -> tuple[PointCloud, dict[
         hair, skin = np.zeros((2, camera.height, camera.width), bool)
         hair[tuple(pixels[seen & scalp].T[::-1])] = True
         skin[tuple(pixels[seen & ~scalp].T[::-1])] = True
-        masks[camera.name] = HairMask(hair | skin, hair, skin & ~hair, "light and lines", 1.0)
+        masks[camera.name] = HairMask(hair | skin, hair, skin & ~hair, "reflectance", 1.0)
         columns.append((p[seen], view[seen], pixels[seen], np.full(seen.sum(), k)))
     points, view, pixel, camera_of = (np.concatenate(c) for c in zip(*columns, strict=True))
     count, zero = len(points), np.zeros(len(points))
