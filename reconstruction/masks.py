@@ -20,7 +20,7 @@ from reconstruction.arrays import Array, Bools
 from reconstruction.capture.folder import Capture, CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.mesh_queries import depth_map, mesh_depth
+from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.hair_features import (
     TwoClasses,
@@ -31,27 +31,27 @@ from reconstruction.images.hair_features import (
 from reconstruction.images.silhouettes import NoSilhouette, silhouette
 from reconstruction.images.visual_hull import trim_edges, visual_hull
 from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.mask_geometry import MaskGeometry, positions
 from reconstruction.report.report import Stage
 
 Source = Literal["user", "geometry", "geometry alone", "reflectance", "silhouette"]
 
-STANDS_OFF = 4e-3  # metres that a point must be off the head to be hair
-OUTLINE = 2e-3  # metres, and a pixel at least, about a head's outline that may be the head's
-_PLACE = 3e-3  # metres: what is so near looks alike
-_SAME_PLACE = 5e-3  # metres: as far apart may two cameras' depths of one place be
+OUTLINE = 2e-3  # metres, at least one pixel: uncertainty of a head's outline
+_PLACE = 3e-3  # metres: cells in which the scores of all cameras are averaged
+_SAME_PLACE = 5e-3  # metres: difference allowed between two cameras' depths of one surface point
 MOST_DISAGREEMENT = 0.15
-"""Of a camera's pixels, `disagreements` above which its mask is doubted: true masks have up to 0.11
-(one pixel is 2 mm, hair and skin are seen past each other), one that lacks half its hair 0.5."""
+"""Share of `disagreements` above which a mask causes a warning: true masks have up to 0.11 (a pixel
+is 2 mm wide), a mask that lacks half of its hair 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
 class HairMask:
     """One camera's pixels `(H, W) bool`: `subject` is the union of `hair` and `skin`, no overlap.
 
-    `source` says who told hair from skin: "light and lines" by looks alone, "geometry" by looks
-    with a head, which has given examples of hair where looks were no two clear classes; with
-    "geometry alone" all of the head looks like one thing, or neither lights nor points say what it
-    is. `decided` is the share of the subject that it decided, the rest follows its neighbours.
+    `source` is the evidence: "reflectance" alone; "geometry", reflectance with examples of hair
+    from the head and the points where needed; "geometry alone" if reflectance forms one cluster or
+    was not measured; "silhouette" if the whole subject counts as hair. `decided` is the share of
+    the subject's pixels with evidence; the rest follows its neighbours.
     """
 
     subject: Bools
@@ -70,13 +70,13 @@ class MaskedCapture:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Those that have a mask."""
+        """Cameras with a mask."""
         return [c for c in self.capture.rig.cameras if c.name in self.masks]
 
     def subject_hull(self, spacing: float) -> VoxelGrid:
-        """The visual hull of hair and skin; ends where only skin runs out of the picture.
+        """The visual hull of hair and skin; cut where only skin reaches the image border.
 
-        Raises `CaptureError` where there is none.
+        Raises `CaptureError` if the masks have no volume in common.
         """
         subjects = {k: trim_edges(m.subject, m.hair) for k, m in self.masks.items()}
         try:
@@ -93,11 +93,10 @@ def hair_masks(
 ) -> dict[str, HairMask]:
     """Masks of every camera that has a user's mask or a silhouette.
 
-    `network` is asked where the user gave no mask. `points` are in the reference pose, `head` the
-    digitised head in the world. A camera without any frame to take a silhouette from, and without
-    a user's mask, is left out. An empty silhouette gives empty masks.
+    `points` are in the reference pose, `head` is the digitised head in the world. A camera with
+    neither a frame nor a user's mask is omitted. An empty silhouette gives empty masks.
     """
-    geometry, masks, views = _Geometry.of(points, head), {}, []
+    geometry, masks, views = MaskGeometry.of(points, head), {}, []
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         if user is None and not any(capture.has(s, camera.name) for s in capture.steps):
@@ -123,94 +122,45 @@ def hair_masks(
 def usable_masks(
     capture: Capture, masks: Mapping[str, HairMask], stage: Stage
 ) -> dict[str, HairMask]:
-    """The masks of the cameras of `capture` that see the subject at all; the others are warned of.
+    """The masks of the cameras of `capture` whose mask shows the subject; warns of the others.
 
-    Raises `CaptureError` where fewer than two are left or none of them has hair.
+    Raises `CaptureError` if fewer than two cameras remain or no mask has hair.
     """
     mine = {c.name: masks[c.name] for c in capture.rig.cameras if c.name in masks}
     out = {name: mask for name, mask in mine.items() if mask.subject.any()}
     if blind := [c.name for c in capture.rig.cameras if c.name not in out]:
-        stage.warn(f"{', '.join(blind)} see nothing of the subject and are left out")
-    if untold := [name for name, mask in out.items() if mask.source == "silhouette"]:
-        where = "" if len(untold) == len(out) else f" in {', '.join(untold)}"
+        stage.warn(f"{', '.join(blind)}: the subject is not visible; these cameras are not used")
+    if silhouettes := [name for name, mask in out.items() if mask.source == "silhouette"]:
+        where = "" if len(silhouettes) == len(out) else f" in {', '.join(silhouettes)}"
         stage.warn(
-            f"hair could not be told from skin{where}: all of the subject counts as hair, a face "
-            "too; give hair masks (masks/CAMERA.png in the capture, `hair` in import.toml) or "
-            "head.obj"
+            f"hair and skin could not be separated{where}: the whole subject counts as hair, "
+            "including the face; provide hair masks (masks/CAMERA.png in the capture, `hair` in "
+            "import.toml) or head.obj"
         )
     if any(mask.source == "geometry alone" for mask in out.values()):
         stage.warn(
-            "nothing tells hair from skin on the head: all of it was taken for one of them: look "
-            "at masks/, and give hair masks where it shows both"
+            "hair and skin could not be separated on the head: all of it was assigned to one of "
+            "them; inspect masks/ and provide hair masks if both are visible"
         )
     if not any(mask.hair.any() for mask in out.values()):
         raise CaptureError(
-            f"{capture.path}: no pixel of any camera is hair: check the lights, the cameras' poses "
-            "and, where given, the hair masks"
+            f"{capture.path}: no pixel of any camera is hair: check the lights, the camera "
+            "poses and the hair masks, if provided"
         )
     if len(out) < 2:
-        raise CaptureError(f"{capture.path}: only {', '.join(out)} sees the subject, not two")
+        raise CaptureError(
+            f"{capture.path}: only {', '.join(out)} shows the subject, expected 2 cameras"
+        )
     return out
 
 
 @dataclass(frozen=True, eq=False)
-class _Geometry:
-    """Triangulated points and the head, as cameras see them; `off` is the points' distance to it.
-
-    `depth (H, W)` along z is that of a camera's own points, or else of the head, 0 for neither.
-    """
-
-    points: PointCloud | None
-    head: Mesh | None
-    off: Array | None
-
-    @classmethod
-    def of(cls, points: PointCloud | None, head: Mesh | None) -> _Geometry:
-        """With the distances, where there are both."""
-        if points is None or head is None or not len(points):
-            return cls(points, head, None)
-        return cls(points, head, distance_to(head, points.points))
-
-    def own(self, camera: Camera) -> Bools:
-        """Which points the camera saw: none where it took no part in the triangulation."""
-        assert self.points is not None
-        names = self.points.cameras
-        return self.points.camera == (names.index(camera.name) if camera.name in names else -1)
-
-    def depth(self, camera: Camera) -> Array:
-        """Depth along z of the camera's own points, or else of the head; 0 for neither `(H, W)`."""
-        out = np.zeros((camera.height, camera.width))
-        if self.points is not None:
-            out = depth_map(camera, self.points.points[self.own(camera)])
-        if self.head is not None:
-            depth = mesh_depth(camera, self.head)
-            out = np.where((out == 0) & np.isfinite(depth), depth, out)
-        return out
-
-    def votes(self, camera: Camera) -> tuple[Array, Array]:
-        """Weights of the points that stand off the head and that lie on it, per pixel `(H, W)`."""
-        size = camera.height, camera.width
-        if self.points is None or self.off is None:
-            return np.zeros(size), np.zeros(size)
-        mine = self.own(camera)
-        seen, x, y, _ = camera.pixels_of(self.points.points[mine])
-        flat = (y * camera.width + x)[seen]
-        weight, standing = self.points.weight[mine][seen], self.off[mine][seen] > STANDS_OFF
-
-        def votes(which: Bools) -> Array:
-            total: Array = np.bincount(flat[which], weight[which], size[0] * size[1]).astype(float)
-            return total.reshape(size)
-
-        return votes(standing), votes(~standing)
-
-
-@dataclass(frozen=True, eq=False)
 class _View:
-    """A camera's `subject`, and what is known of each of its pixels `(H, W)`.
+    """A camera's `subject (H, W)` and the evidence at its pixels.
 
-    `outside` shows the subject `OUTLINE` off the head's, `standing` and `lying` have points off and
-    on the head. `looks (4, P)` are those of `hair_features` at the subject's pixels, None where too
-    few lights were shot.
+    `outside` pixels lie over `OUTLINE` outside the head's outline; `standing` and `lying` pixels
+    have points off and on the head. `looks (4, P)` are the features of `hair_features` at the P
+    pixels of the subject, None with too few lights.
     """
 
     camera: Camera
@@ -221,8 +171,8 @@ class _View:
     looks: Array | None
 
     @property
-    def seen(self) -> Array:
-        """`looks` that are there."""
+    def features(self) -> Array:
+        """`looks`, which must have been measured."""
         assert self.looks is not None
         return self.looks
 
@@ -233,8 +183,8 @@ class _View:
         return out
 
     @classmethod
-    def of(cls, capture: Capture, camera: Camera, subject: Bools, geometry: _Geometry) -> _View:
-        """What `geometry` and the OLAT frames of `capture` say of a camera."""
+    def of(cls, capture: Capture, camera: Camera, subject: Bools, geometry: MaskGeometry) -> _View:
+        """The evidence from `geometry` and the OLAT frames of `capture`."""
         outside, covered = np.zeros((2, *subject.shape), bool)
         if geometry.head is not None:
             depth = mesh_depth(camera, geometry.head)
@@ -242,11 +192,11 @@ class _View:
             outside = subject & ~_beside(covered, camera, depth[covered])
         off, on = geometry.votes(camera)
         standing, lying = subject & (off > on), subject & covered & (on > off)
-        seen = looks(capture, camera.name, subject)
-        return cls(camera, subject, outside, standing, lying, seen)
+        features = looks(capture, camera.name, subject)
+        return cls(camera, subject, outside, standing, lying, features)
 
     def mask(self, hair: Bools, source: Source, decided: float) -> HairMask:
-        """The mask whose hair is `hair (H, W)`, of the subject."""
+        """The mask with `hair (H, W)` restricted to the subject."""
         hair = hair & self.subject
         return HairMask(self.subject, hair, self.subject & ~hair, source, decided)
 
@@ -255,7 +205,7 @@ class _View:
         return self.mask(self.subject, "silhouette", 0.0)
 
     def by_points(self) -> HairMask:
-        """The mask by geometry alone: what has no point follows its neighbours."""
+        """The mask by geometry alone: pixels without a point follow their neighbours."""
         hair = self.outside | self.standing
         skin = self.lying & ~hair
         source: Source = "geometry" if (self.standing | self.lying).any() else "geometry alone"
@@ -265,15 +215,15 @@ class _View:
         return self.mask(_fill(self.subject, hair, skin), source, decided)
 
 
-def _by_looks(views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
-    """Masks of `views` with looks; none where these show one class and geometry knows no hair.
+def _by_looks(views: list[_View], geometry: MaskGeometry) -> dict[str, HairMask]:
+    """Masks of `views` by reflectance; none if it forms one cluster and there are no examples.
 
-    The classes are learned from all cameras together. What a place looks like from all of them
-    counts half as much as what one pixel does.
+    The classes are estimated from all cameras together. A pixel's score is its own plus half the
+    mean score of its surface point over all cameras.
     """
     if not views:
         return {}
-    pixels = np.concatenate([v.seen.T for v in views])
+    pixels = np.concatenate([v.features.T for v in views])
     hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
     if hair.any():
         classes: TwoClasses | None = two_classes(pixels, hair)
@@ -284,8 +234,8 @@ def _by_looks(views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
     source: Source = "reflectance" if geometry.head is None else "geometry"
     if not classes.weights.any():
         source = "geometry alone"
-    scores = [v.image(classes.scores(v.seen)) + v.standing for v in views]
-    places = [_positions(v.camera, v.subject, geometry) for v in views]
+    scores = [v.image(classes.scores(v.features)) + v.standing for v in views]
+    places = [positions(v.camera, v.subject, geometry) for v in views]
     common = _by_place(places, scores)
     out = {}
     for view, score, place in zip(views, scores, common, strict=True):
@@ -296,20 +246,10 @@ def _by_looks(views: list[_View], geometry: _Geometry) -> dict[str, HairMask]:
     return out
 
 
-def _positions(camera: Camera, subject: Bools, geometry: _Geometry) -> Array:
-    """Where in the world the subject's pixels are `(H, W, 3)`, NaN where that is not known."""
-    depth = geometry.depth(camera)
-    y, x = np.nonzero(subject & (depth > 0))
-    rays = camera.rays(np.stack([x, y], axis=1))
-    out = np.full((*subject.shape, 3), np.nan)
-    out[y, x] = camera.center + rays * (depth[y, x] / (rays @ camera.R[2]))[:, None]
-    return out
-
-
 def _by_place(places: list[Array], scores: list[Array]) -> list[Array]:
-    """The mean of `scores (H, W)` of all cameras about each pixel's place, 0 where it has none.
+    """The mean of `scores (H, W)` over all cameras near each pixel's surface point, else 0.
 
-    Of the cells of `_PLACE` metres, weighted by a Gaussian as wide.
+    Averaged in cells of `_PLACE` metres with Gaussian weights of the same width.
     """
     known = [np.isfinite(p[..., 0]) for p in places]
     points = np.concatenate([p[k] for p, k in zip(places, known, strict=True)])
@@ -340,14 +280,15 @@ def report_agreement(
     head: Mesh | None,
     stage: Stage,
 ) -> None:
-    """Leave `disagreements` in the report; warn of those above `MOST_DISAGREEMENT`."""
+    """Record `disagreements` in the report; warn above `MOST_DISAGREEMENT`."""
     found = disagreements(masks, capture.rig.cameras, points, head)
     stage.figures["disagreement"] = found
     if doubted := {k: v for k, v in found.items() if v > MOST_DISAGREEMENT}:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in doubted.items())
         stage.warn(
-            "masks disagree about what is hair; share of the pixels that other cameras contradict: "
-            f"{shares}: look at masks/, give hair masks for these cameras or check their poses"
+            "hair masks disagree between cameras; share of pixels that other cameras classify "
+            f"differently: {shares}; inspect masks/, provide hair masks for these cameras or check "
+            "their poses"
         )
 
 
@@ -357,18 +298,18 @@ def disagreements(
     points: PointCloud | None = None,
     head: Mesh | None = None,
 ) -> dict[str, float]:
-    """By camera, the share of its pixels that the other cameras that see their place contradict.
+    """By camera, the share of its pixels that other cameras classify differently.
 
-    A place is a cell of `_SAME_PLACE` metres, where the camera's own triangulated points or else
-    the head put a pixel. Three in four of the other cameras' pixels there must say hair where the
-    mask says skin, or the reverse: cells at a hairline hold both. Cameras with under a hundred
-    such places are left out.
+    Pixels are compared in cells of `_SAME_PLACE` metres on the surface, located by the camera's own
+    triangulated points or else the head. At least three in four of the other cameras' pixels in the
+    cell must differ, since cells at a hairline hold both. Cameras with under 100 compared pixels
+    are omitted.
     """
-    geometry = _Geometry(points, head, None)
+    geometry = MaskGeometry(points, head, None)
     cells, hairs, owners = [], [], []
     for number, camera in enumerate(c for c in cameras if c.name in masks):
         mask = masks[camera.name]
-        place = _positions(camera, mask.subject, geometry)
+        place = positions(camera, mask.subject, geometry)
         known = np.isfinite(place[..., 0])
         cells.append(np.floor(place[known] / _SAME_PLACE).astype(np.int64))
         hairs.append(mask.hair[known])
@@ -393,40 +334,8 @@ def disagreements(
     return out
 
 
-def distance_to(head: Mesh, points: Array) -> Array:
-    """Distances `(N,)` of `points (N, 3)` in front of the surface of `head`, metres.
-
-    To the nearest of samples 2 mm apart, along their normal where the point is closer than 1 cm:
-    negative inside a closed mesh whose normals point outwards.
-    """
-    samples, normals = _samples(head, 2e-3)
-    distance, index = cKDTree(samples).query(points)
-    height = np.einsum("ni,ni->n", points - samples[index], normals[index])
-    return np.where(distance < 0.01, height, distance)
-
-
-def _samples(head: Mesh, step: float) -> tuple[Array, Array]:
-    """Points `(N, 3)` about `step` apart on every face of `head`, and their normals `(N, 3)`."""
-    corners = head.vertices[head.faces]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    divisions = np.maximum(np.ceil(longest / step).astype(int), 1)
-    normals = head.face_normals()
-    points, faces = [], []
-    for n in np.unique(divisions):
-        of = np.flatnonzero(divisions == n)
-        i, j = np.nonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
-        u, v = (i + 1 / 3) / n, (j + 1 / 3) / n
-        weights = np.stack([1 - u - v, u, v], axis=1)
-        points.append(np.einsum("kc,fci->fki", weights, corners[of]).reshape(-1, 3))
-        faces.append(np.repeat(of, len(weights)))
-    return np.concatenate(points), normals[np.concatenate(faces)]
-
-
 def _beside(covered: Bools, camera: Camera, depth: Array) -> Bools:
-    """What a head is or its outline's error may be `(H, W)`, of the pixels that it has `covered`.
-
-    `depth (P,)` of those, metres.
-    """
+    """Pixels `(H, W)` that the head covers, grown by `OUTLINE` at the median of `depth (P,)`."""
     if not covered.any():
         return covered
     pixels = max(1.0, OUTLINE * camera.K[0, 0] / float(np.median(depth)))
@@ -434,7 +343,7 @@ def _beside(covered: Bools, camera: Camera, depth: Array) -> Bools:
 
 
 def _fill(subject: Bools, hair: Bools, skin: Bools) -> Bools:
-    """Hair over all of the subject: undecided pixels follow decided ones, specks are voted out."""
+    """Hair over the whole subject: undecided pixels follow decided ones, specks are removed."""
     known = (hair | skin).astype(np.float64)
     score = np.zeros(subject.shape)
     for sigma in (1.0, 2.0, 4.0, 8.0):

@@ -25,7 +25,8 @@ from reconstruction.head.lit_skin import (
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
 from reconstruction.light_planes.point_cloud import PointCloud
-from reconstruction.masks import MaskedCapture, distance_to
+from reconstruction.mask_geometry import distance_to
+from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 from reconstruction.tangents.reflection import surface_normals
 

@@ -105,7 +105,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         return
     with progress_bar("import") as progress:
         capture = understood.write(args.out, progress)
-        progress("checking cameras and lights against the images", 1.0)
+        progress("comparing light positions with images", 1.0)
         doubts = check_scene(capture)
     for note in doubts:
         output.note(note)

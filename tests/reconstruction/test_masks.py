@@ -27,11 +27,11 @@ from reconstruction.images.silhouettes import (
     silhouette,
 )
 from reconstruction.light_planes import PointCloud, triangulate
+from reconstruction.mask_geometry import distance_to
 from reconstruction.masks import (
     MOST_DISAGREEMENT,
     HairMask,
     disagreements,
-    distance_to,
     hair_masks,
     report_agreement,
     usable_masks,
@@ -334,7 +334,7 @@ def test_a_head_without_lights_or_points_does_not_tell_hair_from_skin(
     usable_masks(capture, masks, stage := Stage("masks"))
     assert masks["left"].hair.sum() == masks["left"].subject.sum()
     (said,) = stage.warnings
-    assert "nothing tells hair from skin on the head" in said
+    assert "could not be separated on the head" in said
 
 
 def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Capture) -> None:
@@ -345,11 +345,11 @@ def test_with_nothing_to_go_by_all_of_the_subject_may_be_hair(sphere_capture: Ca
     assert np.array_equal(mask.hair, mask.subject)
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     (said,) = stage.warnings
-    assert "all of the subject counts as hair, a face too" in said
+    assert "the whole subject counts as hair" in said
     masks["left"] = replace(mask, source="user")
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     (said,) = stage.warnings
-    assert "not be told from skin in right: all of the subject" in said
+    assert "separated in right: the whole subject" in said
     masks["right"] = replace(masks["right"], source="geometry")
     usable_masks(sphere_capture, masks, stage := Stage("masks"))
     assert stage.warnings == []

@@ -32,11 +32,11 @@ from reconstruction import Capture, Mesh, Model, Progress, Stage, read_strands, 
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.light_planes import triangulate
+from reconstruction.mask_geometry import distance_to
 from reconstruction.masks import (
     HairMask,
     MaskedCapture,
     disagreements,
-    distance_to,
     hair_masks,
 )
 from stage_service.cli.demo import hold_out

@@ -1,4 +1,4 @@
-"""Pictures that do not belong to their cameras or lights: told from small copies of them."""
+"""Light positions that do not fit the images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from reconstruction.geometry.lights import dome_positions
 from reconstruction.images.scene_checks import (
     check_light_axes,
     check_scene,
-    check_silhouettes,
     odd_lights,
 )
 
@@ -47,27 +46,6 @@ def hits(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         points = camera.center + t[..., None] * rays
         normal[nearer] = ((points - center) / radius)[nearer]
     return depth, normal
-
-
-def test_exchanged_cameras_are_named() -> None:
-    stage = cameras()
-    masks = {c.name: np.isfinite(hits(c)[0]) for c in stage}
-    assert check_silhouettes(stage, masks) == []
-    for a, b in (("cam_0", "cam_1"), ("cam_3", "cam_5")):
-        swapped = masks | {a: masks[b], b: masks[a]}
-        (said,) = check_silhouettes(stage, swapped)
-        assert said.startswith(f"{a} and {b}: their pictures, or their poses, seem to be exchanged")
-
-
-def test_a_camera_that_looks_elsewhere_is_named() -> None:
-    stage = cameras()
-    masks = {c.name: np.isfinite(hits(c)[0]) for c in stage}
-    turn = np.radians(4)
-    R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
-    moved = R @ stage[4].R
-    stage[4] = replace(stage[4], R=moved, t=-moved @ stage[4].center)
-    (said,) = check_silhouettes(stage, masks)
-    assert said.startswith("cam_4: its silhouette does not fit the others'")
 
 
 @pytest.fixture(scope="module")
@@ -117,18 +95,18 @@ def test_lights_in_another_world_than_the_cameras_are_told(lit, axes, signs, nam
     pictures, places, eyes = lit
     assert check_light_axes(pictures, places, eyes) == []
     (said,) = check_light_axes(pictures, places[:, axes] * signs, eyes)
-    assert f"were the lights' axes {named}, it would be" in said
+    assert f"with the axes {named} by" in said
 
 
 def test_dark_hair_above_bright_skin_turns_no_axis_round() -> None:
     places = [[np.cos(a), np.sin(a), 0.5 - 0.2 * (a > 2)] for a in (0, 0.8, 1.6, 2.4)]
     above = [Camera.look_at(f"cam_{i}", 96, 80, p, [0, 0, 0], 28) for i, p in enumerate(places)]
     pictures, lights, eyes = shown(above)
-    answers = np.exp(-2.0 * lights[:, 2] / 1.5)  # from below, where skin is, 50 times as bright
-    pictures = pictures * answers[:, None, None]
+    brighter = np.exp(-2.0 * lights[:, 2] / 1.5)  # from below, where skin is, 50 times as bright
+    pictures = pictures * brighter[:, None, None]
     assert check_light_axes(pictures, lights, eyes) == []
     (said,) = check_light_axes(pictures, lights[:, [1, 0, 2]] * [-1, 1, 1], eyes)
-    assert "were the lights' axes y -x z, it would be" in said
+    assert "with the axes y -x z by" in said
 
 
 def test_pictures_that_show_nothing_say_nothing() -> None:
@@ -157,12 +135,7 @@ def test_a_whole_capture_is_held_against_its_pictures(tmp_path: Path) -> None:
         return check_scene(Capture(tmp_path / "capture"))
 
     assert said(rig) == []
-    swapped = [*stage]
-    swapped[3] = replace(stage[5], name="cam_3")
-    swapped[5] = replace(stage[3], name="cam_5")
-    (found,) = said(replace(rig, cameras=tuple(swapped)))
-    assert found.startswith("cam_3 and cam_5: their pictures, or their poses")
     wrong = [*lights]
     wrong[20] = replace(lights[20], position=places[np.argmin(places @ places[20])])
     (found,) = said(replace(rig, lights=tuple(wrong)))
-    assert found.startswith("l20: under it the subject looks as under lights")
+    assert found.startswith("l20: ")
