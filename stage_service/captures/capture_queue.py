@@ -1,8 +1,8 @@
-"""Captures that wait for the stage: kept on disk, begun one after the other, never against anybody.
+"""The queue of captures: stored on disk and started one after the other.
 
-Nothing begins by itself that would need somebody to arm it, nor after a start of the service, a
-blackout, somebody's word that it is dark, an abort, a capture that failed, a jump of the clock or a
-standstill, until a person who has read why says that it may (`Hold`).
+The queue starts no capture that has to be armed. After a start of the service, a blackout, an
+acknowledged latch, an abort, a failed capture, a jump of the clock or a standstill it is held until
+a person who has read the reason releases it (`Hold`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict
 
 from reconstruction.capture.writer import utc_now
 from reconstruction.files.durable import write_json
@@ -31,26 +31,25 @@ from stage_service.records.lease import Leased
 log = logging.getLogger("hairstage.queue")
 POLL_S = 0.5
 STOOD_STILL_S = 10.0
-"""A look that comes so many seconds late: the service was stopped, or starved. Whoever waited for a
-capture has long looked away."""
+"""Delay of the queue's thread, in seconds, after which the service counts as having stood still."""
 MOST_BYTES = 8 << 20
-"""What all that waits may take on the disk."""
+"""Size of all queued requests on the disk."""
 MOST_HISTORY = 1000
 
 
 class QueueFull(RuntimeError):
-    """What waits already takes all the room that there is."""
+    """The queued requests already take `MOST_BYTES`."""
 
 
 class UnknownEntry(LookupError):
-    """The queue has no such entry, or not any more."""
+    """The queue has no such entry: unknown, started or removed."""
 
 
 class Entry(BaseModel):
-    """A capture that waits, was started as `capture`, or was removed; `by` asked for it.
+    """A capture that is queued by `by`, was started as `capture`, or was removed.
 
-    `needs_arming`: its plan flashes, so that somebody at the stage has to start it. `request` is
-    kept while it waits.
+    `needs_arming`: its plan flashes, so a person at the stage has to start it. `request` is stored
+    while it is queued.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -74,21 +73,13 @@ class _Kept(BaseModel):
     waiting: list[Entry] = []
     history: list[Entry] = []
 
-    @field_validator("held", mode="before")
-    @classmethod
-    def _of_another_version(cls, held: object) -> object:
-        if isinstance(held, str):
-            return [Reason(at=utc_now(), why=held)]
-        return () if held is None else held
-
 
 class CaptureQueue(Background):
-    """What waits, in order, in the file `path`; a thread of its own begins it.
+    """Queued captures in the file `path`, in order; a thread of its own starts them.
 
-    `begin(entry)` starts a capture and returns its id; `waits_for()` says what keeps the stage from
-    beginning one by itself, or None: while `hold` holds, that. What `begin` refuses for another
-    reason than that the stage is not free holds the queue. To hold waits for no disk. A file that
-    is broken is set aside.
+    `begin(entry)` starts a capture and returns its id. `waits_for()` returns what keeps the stage
+    from starting one by itself, `hold` included, or None. An error of `begin` holds the queue,
+    unless the stage was not free. Holding waits for no disk. A broken file is renamed.
     """
 
     def __init__(
@@ -103,9 +94,9 @@ class CaptureQueue(Background):
         self._path, self._events, self._hold = path, events, hold
         self._clock = ClockWatch()
         self._begin, self._stage_waits_for = begin, waits_for
-        self._beginning = threading.Lock()  # one at a time, by the thread or by a person
+        self._beginning = threading.Lock()  # one start at a time
         self._writing = threading.Lock()
-        self._told: str | None = None
+        self._published: str | None = None  # the newest "queue.waits"
         self._unsaved = False
         self._kept = self._read()
         hold.recall(self._kept.held)
@@ -114,12 +105,11 @@ class CaptureQueue(Background):
     def start(
         self, begun: Mapping[str, str], unfinished: Collection[str], died: str | None = None
     ) -> None:
-        """Begin, with the captures that `begun` has by their entries' ids. The hold names the
-        capture in which a service `died`, or the last one that was started from here where it is
-        `unfinished`."""
+        """Start the thread. `begun` has captures by their entries' ids. The hold names the capture
+        in which an earlier service `died`, or the queue's last one if it is `unfinished`."""
         with self._changed:
             for entry in list(self._kept.waiting):
-                if entry.id in begun:  # it died between the capture's first file and the queue's
+                if entry.id in begun:  # the service died before it wrote the queue's file
                     self._to_history(entry, "started", begun[entry.id])
             started = (e.capture for e in reversed(self._kept.history) if e.capture is not None)
             last = next(started, None)
@@ -130,30 +120,30 @@ class CaptureQueue(Background):
         self._thread.start()
 
     def waits_for(self) -> str | None:
-        """What the first one waits for; None: nothing, or nothing waits."""
+        """What the first entry waits for; None: nothing, or the queue is empty."""
         with self._changed:
             first = self._kept.waiting[0] if self._kept.waiting else None
         if first is None:
             return None
         reason = self._stage_waits_for()
         if reason is None and first.needs_arming:
-            reason = f"{first.id} flashes: somebody at the stage has to start and arm it"
+            reason = f"{first.id} flashes: a person at the stage has to start and arm it"
         return reason
 
     def waiting(self) -> list[Entry]:
-        """What waits, the next one first."""
+        """The queued entries, the next one first."""
         with self._changed:
             return list(self._kept.waiting)
 
     def history(self, limit: int) -> list[Entry]:
-        """The last ones that were started or removed, the newest first."""
+        """The last started or removed entries, the newest first."""
         with self._changed:
             return self._kept.history[::-1][:limit]
 
     def add(
         self, request: dict[str, Any], by: str, *, needs_arming: bool, place: int | None = None
     ) -> Entry:
-        """Let a capture wait, at the end or at `place` from 0. Raises `QueueFull`, `OSError`."""
+        """Queue a capture, at the end or at `place` from 0. Raises `QueueFull`, `OSError`."""
         name = f"q-{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         entry = Entry(
             id=name, by=printable(by), added=utc_now(), needs_arming=needs_arming, request=request
@@ -161,7 +151,7 @@ class CaptureQueue(Background):
         with self._changed:
             sizes = sum(len(json.dumps(e.request)) for e in (*self._kept.waiting, entry))
             if sizes > MOST_BYTES:
-                raise QueueFull(f"what waits may take {MOST_BYTES:,} bytes, not {sizes:,}")
+                raise QueueFull(f"queued captures may take {MOST_BYTES:,} bytes, not {sizes:,}")
             waiting = self._kept.waiting
             waiting.insert(len(waiting) if place is None else place, entry)
         try:
@@ -170,29 +160,29 @@ class CaptureQueue(Background):
             with self._changed:
                 self._kept.waiting.remove(entry)
             raise
-        self._tell("added", entry)
+        self._publish("added", entry)
         return entry
 
     def move(self, name: str, place: int) -> Entry:
-        """Put it at `place` from 0. Raises `UnknownEntry`."""
+        """Move an entry to `place` from 0. Raises `UnknownEntry`."""
         with self._changed:
             entry = self._find(name)
             self._kept.waiting.remove(entry)
             self._kept.waiting.insert(place, entry)
         self._save()
-        self._tell("moved", entry)
+        self._publish("moved", entry)
         return entry
 
     def remove(self, name: str) -> Entry:
-        """Take it out. Raises `UnknownEntry`."""
+        """Remove an entry. Raises `UnknownEntry`."""
         with self._beginning, self._changed:
             entry = self._to_history(self._find(name), "removed")
         self._save()
-        self._tell("removed", entry)
+        self._publish("removed", entry)
         return entry
 
     def begin(self, name: str, begin: Callable[[Entry], str]) -> Entry:
-        """Start it out of turn, by a person. Raises `UnknownEntry` and what `begin` does."""
+        """Start an entry out of turn, for a person. Raises `UnknownEntry` and what `begin` does."""
         with self._beginning:
             with self._changed:
                 entry = self._find(name)
@@ -222,9 +212,7 @@ class CaptureQueue(Background):
                     self._save()
                 if not closed:
                     self._begin_the_next()
-            # A full disk, or whatever it is: without this thread nothing that waits would ever
-            # begin, and nobody be told; what waits stays.
-            except Exception:
+            except Exception:  # any error, as of a full disk: without this thread nothing starts
                 log.exception("%s", self._path)
                 if closed:
                     return
@@ -234,8 +222,8 @@ class CaptureQueue(Background):
     def _begin_the_next(self) -> None:
         with self._beginning:
             reason = self.waits_for()
-            if reason != self._told:
-                self._told = reason
+            if reason != self._published:
+                self._published = reason
                 self._events.publish("queue.waits", {"for": reason})
             with self._changed:
                 if reason is not None or not self._kept.waiting or self._closed:
@@ -247,9 +235,7 @@ class CaptureQueue(Background):
                 capture = self._begin(entry)
             except (Busy, NotNow, Leased):
                 return
-            # The devices', the plan's, the disk's: it would be refused again, so that a person has
-            # to look at it.
-            except Exception as error:
+            except Exception as error:  # it would be refused again: a person has to read it
                 self._hold.set(f"{entry.id} cannot begin: {error}")
                 return
             self._begun(entry, capture)
@@ -257,7 +243,7 @@ class CaptureQueue(Background):
     def _begun(self, entry: Entry, capture: str) -> Entry:
         with self._changed:
             started = self._to_history(entry, "started", capture)
-        self._tell("started", started)
+        self._publish("started", started)
         self._save()
         return started
 
@@ -282,7 +268,7 @@ class CaptureQueue(Background):
         self._unsaved = True
         return ended
 
-    def _tell(self, what: str, entry: Entry) -> None:
+    def _publish(self, what: str, entry: Entry) -> None:
         data = {"id": entry.id, "by": entry.by, "capture": entry.capture}
         self._events.publish(f"queue.{what}", data)
 

@@ -1,4 +1,4 @@
-"""The capture that is being made: what is known of it meanwhile, and what is counted of all."""
+"""The running capture and its status, and counts of all captures since the start."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from stage_service.records.events import EventLog
 
 
 class CaptureRun:
-    """One run over what a capture lacks; whoever makes it grants its `permission` to light, and
+    """One run over the frames that a capture lacks. Its owner grants `permission` to light and
     starts `sequencer` on `thread`.
 
-    Before a living subject the flash rate is watched, unless the plan has consent and somebody
-    has armed it (`consented`).
+    Before a living subject the flash rate is measured, unless the plan has consent and was armed
+    (`consented`).
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class CaptureRun:
         )
 
     def status(self) -> CaptureStatus:
-        """Where it is now."""
+        """The present status."""
         sequencer = self.sequencer
         written, missing = self._writer.counts()
         progress = sequencer.progress.now()
@@ -76,7 +76,7 @@ class CaptureRun:
         )
 
     def frames(self) -> Counter[str]:
-        """What this run made of frames: "written", "missing" and shot "again"."""
+        """This run's frames: "written", "missing" and shot "again"."""
         written, _ = self._writer.counts()
         records = list(self._writer.records.values())
         return Counter(
@@ -86,7 +86,7 @@ class CaptureRun:
         )
 
     def give_up(self) -> None:
-        """Let go of the folder without having begun."""
+        """Close the folder of a run that was not started."""
         self._writer.close()
 
     def _notify(self, kind: str, data: dict[str, Any]) -> None:
@@ -94,9 +94,9 @@ class CaptureRun:
 
 
 class Tally:
-    """What became of captures, frames and devices since the start. Not locked: the owner is.
+    """Counts of captures, frames and devices' faults since the start. The owner locks it.
 
-    `running`, where given, is the run that is not counted yet.
+    `running` is the run that is not added yet.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Tally:
         self._by_device: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
     def add(self, run: CaptureRun, outcome: str | None) -> None:
-        """Count a run that is over; `outcome` None: one that is in no list, for its faults only."""
+        """Count an ended run; `outcome` None (a snapshot): only its faults."""
         if outcome is not None:
             self._captures[outcome] += 1
             self._frames.update(run.frames())
@@ -115,7 +115,7 @@ class Tally:
             self._by_device[device].update(counts)
 
     def counts(self, running: CaptureRun | None) -> dict[str, dict[str, int]]:
-        """Captures by how they ended, frames by what became of them, faults by device."""
+        """Captures by outcome, frames by result, faults by device."""
         frames = self._frames.copy()
         if running is not None:
             frames.update(running.frames())
@@ -123,7 +123,7 @@ class Tally:
         return {k: dict(v) for k, v in found.items()}
 
     def of_device(self, device: str, running: CaptureRun | None) -> dict[str, int]:
-        """What one device, or camera, did to captures."""
+        """The counts of one device or camera."""
         counts = Counter(timeouts=0, faults=0)
         counts.update(self._by_device[device])
         if running is not None:
@@ -132,18 +132,19 @@ class Tally:
 
 
 def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:
-    """The plan of a capture that is to go on. Raises `PlanError` where it no longer fits."""
+    """The plan of a capture that is to be continued. Raises `PlanError` where it no longer fits."""
     if "plan" not in capture.plan:
-        raise PlanError([f"{capture.path}: this capture was not shot by a plan"])
+        raise PlanError([f"{capture.path}: this capture has no plan: it was not shot here"])
     if capture.rig.to_dict() != rig_file.rig.to_dict():
-        raise PlanError([f"{rig_file.path}: the rig has changed since this capture: begin anew"])
+        changed = "the rig has changed since this capture: start a new one"
+        raise PlanError([f"{rig_file.path}: {changed}"])
     try:
-        asked = CapturePlan.model_validate(capture.plan["plan"])
+        plan = CapturePlan.model_validate(capture.plan["plan"])
     except ValidationError as error:
-        told = f"{capture.path}: its plan is one of another version: {sentence(error)}"
-        raise PlanError([told]) from error
-    plan = resolve(asked, rig_file)
-    if plan.steps != capture.steps:
+        problem = f"{capture.path}: its plan is not of this version: {sentence(error)}"
+        raise PlanError([problem]) from error
+    resolved = resolve(plan, rig_file)
+    if resolved.steps != capture.steps:
         changed = "[capture] has changed since this capture, and with it the plan's steps"
-        raise PlanError([f"{rig_file.path}: {changed}: begin anew"])
-    return plan
+        raise PlanError([f"{rig_file.path}: {changed}: start a new one"])
+    return resolved

@@ -1,4 +1,4 @@
-"""The captures that lie on the disk: read in the background, the newest first."""
+"""The captures on the disk: read in the background, the newest first."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class UnknownCapture(LookupError):
 
 
 class Catalogue:
-    """The captures in `folder` that nobody is shooting, by id; `index` has the statuses of those
-    that have not changed since they were read.
+    """The captures in `folder` that are not being shot, by id; `index` caches the statuses of
+    unchanged ones.
 
-    Their names are looked up once. Each is then read by itself, by `begin`'s thread or when it is
-    asked for; what is unreadable is listed as damaged. Without that thread `list` reads all.
+    The folder is listed once. Each capture is read by `begin`'s thread, or on request; an
+    unreadable one is listed as damaged.
     """
 
     def __init__(self, folder: Path, index: Path) -> None:
         self._folder, self._index = folder, StatusIndex(index)
-        self._lock = threading.Lock()  # for moments
+        self._lock = threading.Lock()  # held briefly
         self._reading = threading.Lock()  # held while a capture is read
         self._found: dict[str, CaptureStatus] = {}
         self._unread: dict[str, Path] | None = None
@@ -42,7 +42,7 @@ class Catalogue:
 
     @property
     def unread(self) -> int:
-        """How many have not been read yet."""
+        """How many captures have not been read yet."""
         return len(self._names())
 
     def begin(
@@ -52,10 +52,9 @@ class Catalogue:
         busy: Callable[[], bool],
         within_s: float,
     ) -> None:
-        """Read all on a thread of its own, which stands still while `busy()`; waits for so long.
+        """Read all on a thread, which pauses while `busy()`; waits for it for `within_s` seconds.
 
-        `each` is told of every capture that is read, by whoever reads it, and `then` is called
-        after the last one.
+        `each(status)` is called for every capture that is read, `then()` after the last one.
         """
         self._each = each
         self._names()
@@ -70,36 +69,36 @@ class Catalogue:
         self._thread.join(within_s)
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self._closed.set()
         if self._thread is not None:
             self._thread.join(timeout=5)
 
     def read(self, name: str) -> None:
-        """Read a capture now, where that is still to be done."""
+        """Read a capture now, unless it was read."""
         folder = self._names().get(name)
         if folder is not None:
             self._read(folder)
 
     def read_all(self) -> None:
-        """Read all now, where no thread does."""
+        """Read all now, unless a thread does."""
         if self._thread is None:
             self._read_all(lambda: False)
 
     def get(self, name: str) -> CaptureStatus:
-        """What is known of a capture that was read. Raises `UnknownCapture`."""
+        """The status of a capture that was read. Raises `UnknownCapture`."""
         with self._lock:
             if name not in self._found:
                 raise UnknownCapture(name)
             return self._found[name]
 
     def list(self) -> list[CaptureStatus]:
-        """Those that were read, in no order."""
+        """All statuses that were read, in no order."""
         with self._lock:
             return list(self._found.values())
 
     def put(self, status: CaptureStatus) -> None:
-        """Nobody is shooting this one any more."""
+        """List a capture that is no longer being shot."""
         with self._lock:
             self._found[status.id] = status
 
@@ -108,21 +107,21 @@ class Catalogue:
         self.put(read_status(self._folder / name))
 
     def take(self, name: str) -> None:
-        """List it no more: it is being shot, or moved away."""
+        """Take a capture off the list: it is being shot, or moved away."""
         unread = self._names()
         with self._lock:
             unread.pop(name, None)
             self._found.pop(name, None)
 
     def _names(self) -> dict[str, Path]:
-        """The folders that are still to be read, the newest first."""
+        """The folders that have not been read, the newest first."""
         with self._lock:
             if self._unread is None:
                 self._unread = {}
                 for path in sorted(self._folder.iterdir(), reverse=True):
                     if printable(path.name) != path.name:
                         name = printable(str(path))
-                        log.warning("%s: the folder's name is not UTF-8: left out", name)
+                        log.warning("%s: the folder's name is not UTF-8: skipped", name)
                     elif not path.name.startswith("."):
                         self._unread[path.name] = path
             return self._unread
@@ -145,7 +144,7 @@ class Catalogue:
             status = self._index.status(folder) if known else None
             with self._lock:
                 del unread[folder.name]
-                if status is None:  # it is no capture
+                if status is None:  # not a capture
                     return
                 self._found[folder.name] = status
         if status.outcome == "damaged":
@@ -158,6 +157,6 @@ def _there(path: Path) -> bool:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return False
-    except OSError:  # it cannot be looked at: that is for `read_status` to say
+    except OSError:  # `read_status` reports it
         return True
     return True

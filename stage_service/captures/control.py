@@ -1,4 +1,4 @@
-"""Steering the stage in somebody's name: who may, and the record of who did."""
+"""Steering the stage in a caller's name: permission, and the record in the audit log."""
 
 from __future__ import annotations
 
@@ -18,22 +18,21 @@ from stage_service.records.tokens import SCOPES, Scope
 
 T = TypeVar("T")
 STAGE = "stage"
-ANSWER_S = 1.0
-"""A blackout is answered within this time: as unknown where it is not over by then."""
+REPLY_S = 1.0
+"""A blackout is replied to within this time, with "unknown" if it has not ended by then."""
 RECORDED_S = 0.3
-"""An answer waits for so long for the audit log's disk; the line follows once that answers. A flush
-takes some ms, on a disk that takes frames some tens."""
+"""A reply waits this long for the audit log's disk; a flush takes 5 to 50 ms."""
 MOST_BLACKOUTS = 16
-"""That go on at once; whoever asks for one more gets what the last of them comes to."""
+"""Concurrent blackouts; a further request gets the result of the newest."""
 LATE = Blackout(
     False,
-    "unknown, unsafe: not every lamp and projector was read back dark in time. The blackout goes "
-    "on: treat every lamp as lit until it reports dark",
+    "unknown, unsafe: not every lamp and projector was read back dark in time. The blackout "
+    "continues: treat every lamp as lit until it is reported dark",
 )
 
 
 class Forbidden(PermissionError):
-    """The caller may not do this; `scope` is what would allow it."""
+    """The caller's token lacks `scope`."""
 
     def __init__(self, scope: Scope) -> None:
         super().__init__(f"this needs a token with the scope {scope!r}")
@@ -42,8 +41,8 @@ class Forbidden(PermissionError):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks: an address, the token of a lease where they have one, and their own token's name
-    ("" where nobody is asked for one) and scopes; and when, where that is known."""
+    """Who sent a request: address, lease token, name and scopes of their own token ("": tokens are
+    off), and the moment of the request."""
 
     address: str
     token: str | None = None
@@ -61,7 +60,7 @@ class Caller:
 
 
 class Control:
-    """Lets callers take turns by leases, and records what each of them does."""
+    """Enforces leases and records every caller's actions."""
 
     def __init__(self, audit: AuditLog, leases: Leases) -> None:
         self.audit, self.leases = audit, leases
@@ -78,9 +77,9 @@ class Control:
         detail: str = "",
         steers: bool = True,
     ) -> T:
-        """`work()`, recorded whatever it comes to; without a subject, its result is that.
+        """`work()`, recorded in any case; `subject` None: its result is the subject.
 
-        What steers raises `Leased` while somebody else holds the lease.
+        With `steers`, raises `Leased` while another caller holds the lease.
         """
         who = self._who(by)
         try:
@@ -95,12 +94,12 @@ class Control:
         return result
 
     def blackout(self, by: Caller, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """`work()`, a blackout, recorded with the state that it came to; anybody may.
+        """`work()`, a blackout, recorded with its state; every caller may.
 
-        Answered within `ANSWER_S` seconds, if need be as `LATE`, while it goes on beside. A disk
-        that holds back the record holds back no answer.
+        Returns within `REPLY_S` seconds, with `LATE` if it has not ended: it continues on its own
+        thread. A slow disk of the audit log delays no reply.
         """
-        who, until = self._who(by), time.monotonic() + ANSWER_S
+        who, until = self._who(by), time.monotonic() + REPLY_S
 
         def recorded() -> tuple[dict[str, Any], Future[None]]:
             try:
@@ -132,8 +131,7 @@ class Control:
     def _record(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
     ) -> None:
-        """The line is on the disk on return, or follows once the disk answers: an abort must not
-        wait for it, nor take the threads of a blackout."""
+        """Record, and wait at most `RECORDED_S` for the disk: an abort must not hang on it."""
         wait([self.audit.later(who, action, subject, result, detail)], RECORDED_S)
 
     def _who(self, caller: Caller) -> str:

@@ -1,4 +1,4 @@
-"""Remembers, beyond a restart, that nobody knows whether the lamps are off."""
+"""The latch: "unknown, unsafe", stored across restarts."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Unsafe(RuntimeError):
 
 
 class CannotAcknowledge(RuntimeError):
-    """Nothing is latched, or the link can tell by itself whether the lamps are off."""
+    """Nothing is latched, or the link reads back by itself whether the lamps are off."""
 
 
 @dataclass(frozen=True)
 class Latched:
-    """Why and since when; `reads_back`: the link can tell that the lamps are off."""
+    """Why and since when; `reads_back`: the link can confirm that the lamps are off."""
 
     since: str
     detail: str
@@ -40,19 +40,18 @@ class Latched:
 
     @property
     def way_out(self) -> str:
-        """What ends it."""
+        """What ends the latch."""
         if self.reads_back:
             return "until a blackout reads every lamp back dark"
         return "until somebody has looked and acknowledges that the lamps are off"
 
 
 class Latch:
-    """ "Unknown, unsafe", kept in `path` until a blackout was read back dark.
+    """ "Unknown, unsafe", stored in `path` until a blackout is read back dark.
 
-    A link that cannot read back never clears it: a person does, by `acknowledge`. A file that is
-    there and cannot be read counts as latched. Which of the two ends it, the stage's devices say,
-    not the file, which may be damaged or of another light bank: until the first blackout, with
-    which a service starts, no person can.
+    Without read-back a person clears it, by `acknowledge`. An unreadable file counts as latched.
+    The stage's devices determine which of the two ends it, not the file, which may be of another
+    light bank: before the first blackout of a service no person can.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +71,7 @@ class Latch:
             raise Unsafe(latched)
 
     def learn(self, result: Blackout, reads_back: bool) -> str | None:
-        """Take a blackout's result; returns "set" or "cleared" when that changes the latch."""
+        """Apply a blackout's result; returns "set" or "cleared" if the latch changed."""
         with self._lock:
             was = self.latched
             if result.blocks:
@@ -88,13 +87,13 @@ class Latch:
         return None
 
     def check_acknowledge(self) -> None:
-        """Raise `CannotAcknowledge` where it is not for a person to clear it."""
+        """Raise `CannotAcknowledge` unless a person may clear it."""
         if (latched := self.latched) is None:
             raise CannotAcknowledge("nothing is latched: there is nothing to acknowledge")
         if latched.reads_back:
             raise CannotAcknowledge(
-                "this light bank reports itself whether its lamps are off: send a blackout once it "
-                "answers"
+                "this light bank reads back whether its lamps are off: send a blackout once it "
+                "replies"
             )
 
     def acknowledge(self) -> None:
@@ -107,12 +106,12 @@ class Latch:
         self.latched = latched
         try:
             write_whole(self._path, json.dumps(asdict(latched)).encode())
-        except OSError:  # a full disk must not keep anybody from a blackout
-            log.exception("%s cannot be written: it ends with this process", self._path)
+        except OSError:  # a full disk must not fail a blackout
+            log.exception("%s cannot be written: the latch ends with this process", self._path)
 
     def _clear(self) -> None:
         try:
             self._path.unlink(missing_ok=True)
-        except OSError:  # it is latched again at the next start
+        except OSError:  # latched again at the next start
             log.exception("%s cannot be removed", self._path)
         self.latched = None

@@ -1,4 +1,4 @@
-"""Snapshots: one exposure to look at, kept until the next one and apart from the captures."""
+"""Snapshots: a single exposure, kept until the next one and apart from the captures."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from stage_service.plan.resolved import ResolvedPlan, resolve
 from stage_service.plan.stepping import runs
 
 SNAPSHOT = "snapshot"
-"""The id of the capture that it is; the newest only."""
+"""The id of the newest snapshot."""
 APART_S = 1 / SLOW_HZ
-"""From one to the next, at least: who looks again and again must not flash at a living subject."""
+"""Shortest interval between snapshots, so that they do not flash at a living subject."""
 
 
 def one_step(

@@ -1,4 +1,4 @@
-"""The devices of one stage between captures: who has them, what they said, what is lit."""
+"""The devices of one stage between captures: ownership, status, darkness."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from stage_service.records.events import EventLog
 
 
 def unknown(detail: str, latched: str | None) -> dict[str, Any]:
-    """What `Stage.darkness` tells where nobody knows, and nobody accepts that."""
+    """The state of lamps that may be lit, as `Stage.darkness` returns it."""
     state = {"state": "unknown, unsafe", "detail": detail}
     return {**state, "latched": latched, "accepted": False}
 
 
 def put_off(rig_file: RigFile, root: Path, *, take_over: bool = False) -> str:
-    """Put a stage off whose service cannot have its `root`; what came of it, in words.
+    """Put a stage off whose service cannot use its `root`; returns the result in words.
 
-    Touches nothing where another service has the stage.
+    Does nothing while another service has the stage.
     """
     if rig_file.devices is None:
         return "the rig file names no devices"
@@ -48,13 +48,13 @@ def put_off(rig_file: RigFile, root: Path, *, take_over: bool = False) -> str:
 
 
 class Stage:
-    """All who connect to the devices outside a capture go through here, one after the other.
+    """Every connection to the devices outside a capture, one after the other.
 
-    `lit()` says whether a capture has the devices now; `revoke(why)` takes the right to light from
-    every capture, which the latch does when it is set. Constructing connects to nothing; raises
-    `RigError` for devices that cannot be, and `StageInUse` while another process on this machine
-    has the stage, `take_over` says that one on another machine has it no more. A blackout that
-    could not be verified is latched (`latch`), which is recorded in `audit`.
+    `lit()`: a capture has the devices now. `revoke(why)`, called when the latch is set, revokes
+    every capture's permission to light. An unverified blackout is latched (`latch`) and recorded in
+    `audit`. Constructing connects to nothing. Raises `RigError` for an invalid rig file,
+    `StageInUse` while another process on this machine has the stage; `take_over`: the service of
+    another machine that has it is dead.
     """
 
     def __init__(
@@ -85,12 +85,12 @@ class Stage:
 
     @cached_property
     def devices(self) -> DeviceSet:
-        """The one set of them; nothing is connected by asking for it."""
+        """The only set of drivers; connects to nothing."""
         return DeviceSet.of(self._rig_file)
 
     @contextmanager
     def alone(self) -> Iterator[DeviceSet]:
-        """Nobody else connects for a moment (a serial port has room for one); closes after it."""
+        """A context for a short connection (a serial port has one user); closes it at the end."""
         with self._one:
             try:
                 yield self.devices
@@ -98,32 +98,32 @@ class Stage:
                 self.devices.close()
 
     def wait_for_others(self) -> None:
-        """Return once nobody holds a short connection any more; opens and closes none."""
+        """Return once no short connection is open."""
         with self._one:
             pass
 
     def take(self) -> None:
-        """Have the stage for this service, before anything is commanded. Raises `StageInUse`."""
+        """Take the stage for this service, before any command. Raises `StageInUse`."""
         if self._ownership is not None:
             with self.alone() as devices:
                 self._ownership.claim(devices.lights)
 
     def release(self) -> None:
-        """Let others have it."""
+        """Release the stage."""
         if self._ownership is not None:
             self._ownership.release(self.devices.lights)
 
     def darken(self) -> None:
-        """Put everything off that answers, as the service starts; what does not is latched."""
+        """Put everything off, as the service starts; latched where it is not verified."""
         if self.there:
             with self.alone() as devices:
                 self.learn(blackout(devices, attempts=1))
 
     def learn(self, result: Blackout) -> None:
-        """Keep what a blackout came to, and latch or unlatch.
+        """Store a blackout's result, and latch or unlatch.
 
-        What is older than what is known counts for nothing: a run that hung tells its last blackout
-        when it ends, and others, or a person who has looked, may have found out more meanwhile.
+        A result older than the stored one is ignored: a run that hung reports its last blackout
+        when it ends, after newer results.
         """
         beams = self.devices.projectors
         lamps = self.devices.lights.capabilities.reads_back
@@ -133,19 +133,19 @@ class Stage:
                 return
             self._last = result
             change = self.latch.learn(result, reads_back)
-        self._tell(change, result)
+        self._publish(change, result)
 
     def acknowledge(self, said: str) -> None:
-        """Unlatch on the word of a person who has looked, until a blackout says otherwise; `said`:
-        who they are and what they saw. Raises `CannotAcknowledge`."""
+        """Unlatch on the word of a person who has looked; `said`: their name and what they saw. The
+        next blackout replaces it. Raises `CannotAcknowledge`."""
         with self._learning:
             self.latch.acknowledge()
             word = Blackout(False, f"somebody has looked: {said}", accepted=True, said=True)
             self._last = word
-        self._tell("cleared", word)
+        self._publish("cleared", word)
 
-    def _tell(self, change: str | None, result: Blackout) -> None:
-        """Record and publish what `result` did to the latch, and what is known of the lamps."""
+    def _publish(self, change: str | None, result: Blackout) -> None:
+        """Record and publish a change of the latch, and the lamps' state."""
         if change == "set":
             self._revoke(f"the stage was latched: {result.detail}")
         if change is not None:
@@ -154,8 +154,8 @@ class Stage:
         self._events.publish("stage.lamps", self.darkness())
 
     def darkness(self) -> dict[str, Any]:
-        """What is known of the lamps when no capture runs: {"state", "detail", "latched",
-        "accepted"}; accepted: off was sent, and the rig file accepts that no more is known."""
+        """The lamps' state without a capture: {"state", "detail", "latched", "accepted"}; accepted:
+        off was sent, and the rig file accepts that it is not read back."""
         none_yet = "no blackout yet" if self.there else "the rig file names no devices"
         last, latched = self._last or Blackout(False, none_yet), self.latch.latched
         if latched is not None:
@@ -166,27 +166,27 @@ class Stage:
 
     @property
     def known_dark(self) -> bool:
-        """Whether a blackout, or somebody's look, came to what a capture may begin after."""
+        """Whether the last blackout, or a person's word, allows a capture to start."""
         return self._last is not None and not self._last.blocks
 
     def query(self) -> dict[str, Any]:
-        """What the devices say, with its age; they are asked anew, but not waited for."""
-        return self._seen.get() if self.there else {"age_s": None}
+        """The devices' newest status with its age in seconds; starts a new query."""
+        return self._status.get() if self.there else {"age_s": None}
 
     def states(self) -> dict[str, str]:
-        """Each device's state when it was last asked, by kind or a camera's name; asks nobody."""
+        """Each device's state at the last query, by kind or a camera's name; queries none."""
         if not self.there:
             return {}
-        seen = self._seen.peek()
-        named = {**seen.pop("cameras", {}), **seen}
+        found = self._status.peek()
+        named = {**found.pop("cameras", {}), **found}
         return {k: v["state"] for k, v in named.items() if isinstance(v, dict) and "state" in v}
 
     @cached_property
-    def _seen(self) -> CachedStatus:
-        return CachedStatus(self._look, self.devices.unqueried())
+    def _status(self) -> CachedStatus:
+        return CachedStatus(self._query, self.devices.unqueried())
 
-    def _look(self) -> dict[str, Any] | None:
-        """Ask the devices; without a capture, connect for the answer, until one begins."""
+    def _query(self) -> dict[str, Any] | None:
+        """Query the devices; without a capture, connect for it, until one starts."""
         with self._one:
             if self._lit():
                 return self.devices.status(connect=False)

@@ -1,4 +1,4 @@
-"""The statuses of captures that have not changed since they were read, in one file."""
+"""A cache of captures' statuses in one file, valid while their files are unchanged."""
 
 from __future__ import annotations
 
@@ -13,53 +13,52 @@ from stage_service.acquisition.states import CaptureStatus, read_status
 
 log = logging.getLogger("hairstage.captures")
 FILES = ("plan.json", "rig.json", "journal.jsonl", "manifest.json")
-"""A capture's status is told by these: while they are the same files, of the same size and time, it
-is the same."""
+"""The files that determine a capture's status; their inode, size and time are its stamp."""
 Stamp = list[list[int] | None]
 
 
 class StatusIndex:
-    """The statuses that `file` knows; one that cannot be used is made anew."""
+    """The statuses cached in `file`; an unusable file is replaced."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._known: dict[str, tuple[Stamp, Any]] | None = None
         self._lines: list[str] = []
-        self._anew = False
+        self._changed = False
 
     def status(self, folder: Path) -> CaptureStatus:
-        """A folder's status, as `read_status` has it; read again only where it has changed."""
-        if folder.is_symlink():  # the files that would stamp it are not looked at
+        """A folder's status, as `read_status`; read again only if its files have changed."""
+        if folder.is_symlink():  # nothing behind a link is read
             return read_status(folder)
         if self._known is None:
             self._known = _known(self._file)
         stamp = [_stamp(folder / name) for name in FILES]
-        stamped, told = self._known.get(folder.name, (None, None))
-        status = _status(told, folder) if stamped == stamp else None
+        stamped, cached = self._known.get(folder.name, (None, None))
+        status = _status(cached, folder) if stamped == stamp else None
         if status is None:
-            status, self._anew = read_status(folder), True
-            told = status.model_dump(mode="json")
-        if status.outcome != "damaged":  # that is looked at again
-            self._lines.append(json.dumps([folder.name, stamp, told]))
+            status, self._changed = read_status(folder), True
+            cached = status.model_dump(mode="json")
+        if status.outcome != "damaged":  # a damaged one is read at every start
+            self._lines.append(json.dumps([folder.name, stamp, cached]))
         return status
 
     def save(self) -> None:
-        """Keep what was asked for, where the file lacked any of it."""
-        if not self._anew:
+        """Write the file, if any status was not in it."""
+        if not self._changed:
             return
         try:
             write_whole(self._file, "\n".join(self._lines).encode())
-        except OSError as error:  # a full disk: the next start takes longer
+        except OSError as error:  # a full disk: the next start is slower
             log.warning("%s: %s", self._file, error)
 
 
 def _known(index: Path) -> dict[str, tuple[Stamp, Any]]:
     try:
         lines = [parse_json(line) for line in index.read_bytes().splitlines()]
-        return {str(name): (stamp, told) for name, stamp, told in lines}
+        return {str(name): (stamp, status) for name, stamp, status in lines}
     except (OSError, ValueError, TypeError) as error:
         if not isinstance(error, FileNotFoundError):
-            log.warning("%s: made anew: %s", index, error)
+            log.warning("%s: replaced: %s", index, error)
         return {}
 
 
@@ -71,8 +70,8 @@ def _stamp(file: Path) -> list[int] | None:
     return [found.st_ino, found.st_size, found.st_mtime_ns]
 
 
-def _status(told: Any, folder: Path) -> CaptureStatus | None:
+def _status(cached: Any, folder: Path) -> CaptureStatus | None:
     try:
-        return CaptureStatus.model_validate({**told, "path": str(folder)})
+        return CaptureStatus.model_validate({**cached, "path": str(folder)})
     except (ValueError, TypeError):
         return None

@@ -32,7 +32,7 @@ FULL_SCALE, BLACK, GAIN = 4095, 64, 10000.0
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A blackout's answer is waited for however busy the machine is, and so are audit's lines."""
-    monkeypatch.setattr(control, "ANSWER_S", 60.0)
+    monkeypatch.setattr(control, "REPLY_S", 60.0)
     monkeypatch.setattr(control, "RECORDED_S", 60.0)
 
 

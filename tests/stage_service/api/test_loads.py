@@ -24,8 +24,7 @@ from reconstruction import CaptureWriter, Step
 from stage_service import watching
 from stage_service.api.gate import Access
 from stage_service.api.places import LIMITS
-from stage_service.captures import control, status_index
-from stage_service.captures import manager as manager_module
+from stage_service.captures import control, light_control, status_index
 from stage_service.captures.catalogue import Catalogue
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.jobs.slots import WorkerSlot
@@ -134,7 +133,7 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
         world.show = "ON 65535"
         with stuck_lights(world):
             flood(http, "GET", "/devices", count=5)
-            monkeypatch.setattr(manager_module, "LATE_AFTER_S", 0.0)
+            monkeypatch.setattr(light_control, "LATE_AFTER_S", 0.0)
             flood(http, "POST", "/devices/blackout", count=1)
             until(lambda: http.get("/health").json()["lamps"] == "unknown, unsafe")
             events = http.service.events.after
@@ -156,7 +155,7 @@ def test_devices_that_hang_keep_nobody_waiting_who_asked_for_darkness(
 ):
     """The answer is "unknown, unsafe"; what it comes to in the end is told, and recorded."""
     with serving(rig_file, tmp_path) as http:
-        monkeypatch.setattr(control, "ANSWER_S", 0.0)
+        monkeypatch.setattr(control, "REPLY_S", 0.0)
         with stuck(monkeypatch, ModbusLightBank, "off") as waiting:
             for _ in range(3 * control.MOST_BLACKOUTS):
                 answer = http.post("/devices/blackout").json()
@@ -176,7 +175,7 @@ def test_devices_that_hang_keep_nobody_waiting_who_asked_for_darkness(
 
 def test_projectors_go_dark_while_the_run_waits_for_a_lamp(rig_file, world, tmp_path, monkeypatch):
     """Not one deadline after another: that of the lamp first, then that of the blackout."""
-    monkeypatch.setattr(manager_module, "GIVEN_UP_S", 3600.0)
+    monkeypatch.setattr(light_control, "GIVEN_UP_S", 3600.0)
     with serving(rig_file, tmp_path) as http:
         with stuck(monkeypatch, ModbusLightBank, "select") as waiting:
             http.post("/captures", json=LONG)
@@ -210,7 +209,7 @@ def test_while_the_disk_hangs(rig_file, world, tmp_path, monkeypatch):
         assert_it_can_be_darkened(http, world, capture)
         assert http.get(f"/captures/{capture}").json()["state"] != "done"
         assert http.post("/captures", json=LONG).status_code == 409
-        assert time.monotonic() - start < manager_module.STOP_WITHIN_S
+        assert time.monotonic() - start < light_control.STOP_WITHIN_S
 
 
 class Slow(PosixPath):
