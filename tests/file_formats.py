@@ -253,7 +253,7 @@ TOKENS = [{"name": "ada", "scopes": ["read"], "sha256": "0" * 64, "made": "2026-
 MODEL = ("appearance.json", "hair_maps.npz", "lights.json", "field.npz", "scalp_map.npz")
 MODEL += ("points.npz", "report.json")
 ENTRY = {"id": "q1", "by": "ada", "added": "2026-01-01T00:00:00Z", "request": {"plan": {}}}
-QUEUE = {"held": None, "waiting": [ENTRY], "history": []}
+QUEUE = {"held": [], "waiting": [ENTRY], "history": []}
 INDEX = ["x", [[1, 2, 3], [4, 5, 6], None, None], {"id": "x", "state": "done", "frames": 3}]
 SETTINGS = b"""exposure = 0.02
 units = "radiance"

@@ -22,10 +22,10 @@ SELECT, STATUS, OFF = "6 1000", "4 0", "6 1003"
 TOLD = {
     "silent": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
     "late": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
-    "garbage": (DeviceTimeout, "within {timeout} s, received no answer in 10 bytes: 00 ff 68 73"),
-    "crc": (DeviceTimeout, "within {timeout} s, received no answer in 8 bytes: 07 06 03 e8"),
-    "nak": (DeviceError, r"expected an answer, received Modbus exception 4 \(refused now\)"),
-    "echo": (DeviceError, "expected the answer function 6, 6 at 1000, received function 6, 7 at"),
+    "garbage": (DeviceTimeout, "within {timeout} s, received no reply in 10 bytes: 00 ff 68 73"),
+    "crc": (DeviceTimeout, "within {timeout} s, received no reply in 8 bytes: 07 06 03 e8"),
+    "nak": (DeviceError, r"expected a reply, received Modbus exception 4 \(refused now\)"),
+    "echo": (DeviceError, "expected the reply function 6, 6 at 1000, received function 6, 7 at"),
     "unplug": (DeviceUnreachable, "expected a reply within {timeout} s, received none"),
 }
 # On TCP its header says at once that it is no answer.
@@ -88,7 +88,7 @@ def test_a_disturbed_reading_is_told_and_what_follows_is_right(bench, kind):
 def test_bytes_before_an_rtu_answer_are_no_answer(bench):
     one = bench(RTU, Fault("lights", "noise", 1, request=SELECT))
     one.pulses = 1
-    with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .* received no answer in 18 bytes: 00 ff"):
+    with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .* received no reply in 18 bytes: 00 ff"):
         one.driver.select(5)
     one.driver.off()
     assert one.lit() == []

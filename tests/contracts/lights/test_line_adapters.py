@@ -111,7 +111,7 @@ def test_a_line_feed_around_an_answer_is_told_and_is_none_by_itself(bench, where
     one = bench(RTU)
     one.driver.select(5)
     one.peer.stand_behind(Adapter(**{where: b"\n"}))
-    with pytest.raises(DeviceError, match=r"lamp 6 on: .*received no answer in \d+ bytes: .*0a"):
+    with pytest.raises(DeviceError, match=r"lamp 6 on: .*received no reply in \d+ bytes: .*0a"):
         one.driver.select(6)
     one.peer.stand_behind(Adapter())
     one.driver.off()
@@ -124,7 +124,7 @@ def test_a_line_feed_alone_is_no_answer(bench):
     one = bench(RTU)
     send = one.peer._terminal.send
     one.peer._terminal.send = lambda _answer: send(b"\n")
-    with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .*received no answer in 1 bytes: 0a"):
+    with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .*received no reply in 1 bytes: 0a"):
         one.driver.select(5)
     one.peer._terminal.send = send
     one.driver.off()
@@ -193,9 +193,9 @@ CHANGES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     ),
     "bytes behind it": (
         lambda a: a + b"more",
-        "nothing behind it, received no answer in 4 bytes: 6d 6f 72 65",
+        "nothing behind it, received no reply in 4 bytes: 6d 6f 72 65",
     ),
-    "two of each": (lambda a: a + a, r"nothing behind it, received no answer in \d+ bytes"),
+    "two of each": (lambda a: a + a, r"nothing behind it, received no reply in \d+ bytes"),
     "a count of bytes that is not so": (
         lambda a: a[:8] + bytes([a[8] + 1]) + a[9:] if a[7] in (3, 4) else a,
         "received function [34] in",

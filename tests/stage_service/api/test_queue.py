@@ -200,7 +200,7 @@ def test_nothing_begins_after_a_service_that_died_in_a_capture(rig_file, tmp_pat
     if not then_removed:
         (root / "shooting").write_text(f"{capture['id']}\n")
     kept = json.loads((root / "queue.json").read_text())
-    (root / "queue.json").write_text(json.dumps(kept | {"held": None}))
+    (root / "queue.json").write_text(json.dumps(kept | {"held": []}))
     with serving(rig_file, root) as http:
         assert capture["id"] in http.get("/queue").json()["held"]
         assert c in [e["id"] for e in http.get("/queue").json()["waiting"]]
