@@ -1,4 +1,4 @@
-"""A model against the truth: its strands beside baselines that use no method, its appearance."""
+"""A model against ground truth: its strands, with baselines, and its appearance."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def evaluate_geometry(
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Score `model`'s strands and what they are compared with against the strand file `truth`.
+    """Score `model`'s strands and the baselines against the strand file `truth`.
 
-    Returns `{visible, all}` of ours and `baselines.{true_directions, hull_vertical,
-    hull_smooth_field}` with the same two. The true strands stand where the subject stood during the
-    OLAT pass. The hulls get the masks that the reconstruction had: those of the cameras that are
-    not held out. `true_directions` are ours with the truth's over a pixel.
+    Returns `{visible, all}` of the strands and the same of `baselines.{true_directions,
+    hull_vertical, hull_smooth_field}`. The true strands are posed as during the OLAT pass. The
+    hulls use the masks of the cameras that are not held out, as the reconstruction does.
+    `true_directions` are our strands with the true directions over a pixel.
     """
     from reconstruction import read_strands
     from reconstruction.evaluation.assessment import true_direction_figures
@@ -64,12 +64,11 @@ def evaluate_geometry(
 def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     """`model`'s roughness and colours (`fitted`) beside those of the JSON file `truth` (`true`).
 
-    Fitted is what is rendered; if that is inverse rendering, both fits are listed as well
-    (`sun_fit`, `inverse_rendering`). Of maps the colour is the mean over the cells. Sun's fit has
+    `fitted` is the rendered appearance; after inverse rendering both fits are listed as well
+    (`sun_fit`, `inverse_rendering`). The colour of maps is the mean over their cells. Sun's fit has
     the 95 % interval of its roughness, `beta_m_interval`, and standard errors of logarithms,
-    `beta_m_error` and `sigma_a_error (3,)`, None in a channel whose colour does not determine it.
-    Absorptions are compared as dense hair's albedo (Sun 2021, Eq. 11), because the fit holds beta_n
-    at Sun's value: the same absorption means another colour under another beta_n.
+    `beta_m_error` and `sigma_a_error (3,)`, None in an undetermined channel. Absorptions are
+    compared as the albedo of dense hair (Sun 2021, Eq. 11), because the fit fixes beta_n.
     """
     from appearance import HairAppearance
     from appearance.bsdf.longitudinal import colour_of_absorption, variance_of_roughness

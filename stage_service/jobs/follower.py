@@ -1,4 +1,4 @@
-"""The thread that talks to the job database by itself, so that nothing else has to wait for it."""
+"""The thread that polls the job database, so that nothing else waits for it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from stage_service.records.logs import CAUSES
 log = logging.getLogger("hairstage.jobs")
 POLL_S = 0.5
 COUNT_S = 5.0
-"""How old the count of jobs that wait may be."""
+"""Largest age of the count of queued jobs, in seconds."""
 FOLLOWING = "following the jobs"
-"""As the log names what is wrong with that."""
+"""The cause in the log."""
 JOB_END = "job.end"
 MOST_ENDS = 1000
-"""Jobs, and lines of the audit log, that are looked at for ends that nobody has recorded."""
+"""Jobs, and lines of the audit log, that are searched for ends without a record."""
 
 
 @dataclass(frozen=True)
 class _Wish:
-    """The pipeline that a capture was asked to be followed by; `fresh`: it has just completed."""
+    """The pipeline requested for a capture; `fresh`: the capture has just completed."""
 
     pipeline: PipelineRequest
     capture: Path
@@ -39,41 +39,41 @@ class _Wish:
 
 
 class JobFollower:
-    """Enqueues what completed captures were asked to be followed by, and tells what becomes of
-    jobs. While the database is away it tries again."""
+    """Enqueues the pipelines requested for completed captures, and publishes and audits jobs'
+    progress and ends. Retries while the database is unavailable."""
 
     def __init__(self, root: Path, queue: JobQueue, events: EventLog, audit: AuditLog) -> None:
         self._root, self._queue, self._events, self._audit = root, queue, events, audit
         self.waiting: Waiting | None = None
         self.waiting_at = 0.0
         self._lock = threading.Lock()
-        self._pending: dict[str, _Wish] = {}  # by capture: its job may not exist yet
-        self._certain: set[str] = set()  # captures whose job is there
+        self._pending: dict[str, _Wish] = {}  # by capture; its job may exist
+        self._certain: set[str] = set()  # captures whose job exists
         self._wake = threading.Event()
         self._closed = False
-        self._seen: dict[str, Job] = {}  # the newest, and whatever is not done
-        self._audited: set[str] | None = None  # jobs that had ended before
+        self._known: dict[str, Job] = {}  # the newest jobs, and those not done
+        self._audited: set[str] | None = None  # jobs whose end is recorded
         self._thread = threading.Thread(target=self._run, name="job-events", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """End; a database that hangs is not waited for."""
+        """End the thread; waits 5 s for a database that hangs."""
         self._closed = True
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5)
 
     def follow_up(self, status: CaptureStatus, *, fresh: bool = True) -> None:
-        """Take note of a capture that completed. One that is not `fresh` may have its job."""
-        asked = status.request.get("pipeline")
-        if asked is None:
+        """Enqueue the pipeline of a completed capture; one that is not `fresh` may have its job."""
+        requested = status.request.get("pipeline")
+        if requested is None:
             return
         try:
-            pipeline = PipelineRequest.model_validate(asked)
-        except ValidationError as error:  # a capture of another version must not stop this one
+            pipeline = PipelineRequest.model_validate(requested)
+        except ValidationError as error:  # a capture of another version
             log.warning("%s: its pipeline cannot be run: %s", status.path, error)
             return
         self._pending[status.id] = _Wish(pipeline, Path(status.path), fresh)
@@ -84,12 +84,12 @@ class JobFollower:
         return capture in self._pending
 
     def job_after(self, capture: str) -> str | None:
-        """The id of the job that follows the capture, there already or about to be."""
+        """The id of the capture's job, enqueued or pending."""
         there = capture in self._certain or capture in self._pending
         return job_of(capture) if there else None
 
     def enqueue_now(self, job: str) -> Job | None:
-        """The job that is still owed under this id. Raises `JobsUnavailable`."""
+        """Enqueue the pending job of this id; None without one. Raises `JobsUnavailable`."""
         capture = job.removeprefix(job_of(""))
         with self._lock:
             wish = self._pending.get(capture)
@@ -103,13 +103,13 @@ class JobFollower:
                 return
             try:
                 self._enqueue_pending()
-                self._tell()
+                self._publish()
                 if time.monotonic() - self.waiting_at > COUNT_S:
                     self.waiting, self.waiting_at = self._queue.waiting(), time.monotonic()
                 CAUSES.over(log, FOLLOWING)
             except JobsUnavailable:  # which the queue has logged
                 pass
-            except Exception as error:  # the thread goes on
+            except Exception as error:  # any error: the thread continues
                 CAUSES.failed(log, FOLLOWING, error, error)
 
     def _enqueue_pending(self) -> None:
@@ -123,13 +123,13 @@ class JobFollower:
                     self._certain.add(capture)
                     del self._pending[capture]
                 elif begun and not wish.fresh:
-                    log.warning("%s: its job is lost; the model stays as it is", wish.capture)
+                    log.warning("%s: its job is lost; the model is kept as it is", wish.capture)
                     del self._pending[capture]
                 else:
                     self._enqueue(capture, wish)
 
     def _enqueue(self, capture: str, wish: _Wish) -> Job:
-        # One id per capture: enqueuing again after a crash is not a second job.
+        # One id per capture: enqueuing again after a crash makes no second job.
         model = Model(self._root / "models" / capture)
         job = self._queue.submit(wish.pipeline, wish.capture, model, job=job_of(capture))
         self._certain.add(capture)
@@ -137,18 +137,18 @@ class JobFollower:
         self._audit.record(SERVICE, "job.submit", job.id, detail=f"{job.pipeline} on {capture}")
         return job
 
-    def _tell(self) -> None:
-        """Publish what has changed; ends are audited, those since the service last looked, too."""
+    def _publish(self) -> None:
+        """Publish changes; record ends in the audit log, also those while no service ran."""
         if self._audited is None:
             ends = [a for a in self._audit.latest(MOST_ENDS) if a.action == JOB_END]
             self._audited = {action.subject for action in ends}
-        newest = self._queue.all(limit=50 if self._seen else MOST_ENDS)
+        newest = self._queue.all(limit=50 if self._known else MOST_ENDS)
         found = {job.id: job for job in reversed(newest)}
-        older = [i for i, job in self._seen.items() if job.state != "done" and i not in found]
+        older = [i for i, job in self._known.items() if job.state != "done" and i not in found]
         if older:
             found.update({job.id: job for job in self._queue.several(older)})
         for job in found.values():
-            before = self._seen.get(job.id)
+            before = self._known.get(job.id)
             if before is None or (before.state, before.outcome) != (job.state, job.outcome):
                 if job.state == "done" and job.id not in self._audited:
                     self._audited.add(job.id)
@@ -158,7 +158,7 @@ class JobFollower:
             if job.progress is not None and (before is None or before.progress != job.progress):
                 data = {"job": job.id, **job.progress.model_dump(mode="json")}
                 self._events.publish("job.progress", data)
-        self._seen = found
+        self._known = found
 
 
 def _end(job: Job) -> str:
@@ -167,5 +167,5 @@ def _end(job: Job) -> str:
 
 
 def job_of(capture_id: str) -> str:
-    """The id of the job that a capture's completion enqueues."""
+    """The id of a capture's job."""
     return f"job-{capture_id}"

@@ -18,11 +18,11 @@ PIPELINES: dict[str, tuple[str, ...]] = {
     "appearance": ("fit", "inverse_rendering", "assess", "results"),
     "fields": ("fit", "inverse_rendering", "fields", "assess", "results"),
 }
-"""Each step is a checkpoint: after a crash the job goes on at the step that was under way. What
-nobody waits for comes last: results and pictures are there before frames are compressed."""
+"""Each step is a checkpoint: after a crash the job resumes at the step that was under way.
+Compression is last, so that it delays no results."""
 
 RENDERING = frozenset({"fit", "inverse_rendering", "fields", "assess"})
-"""Steps that a GPU makes several times faster, where Dr.Jit has one."""
+"""Steps that run several times faster on a GPU."""
 
 STEPS_VERSION = "5"
-"""Raise it when a pipeline's steps change: a job begun under other steps is not taken up again."""
+"""Raise it when a pipeline's steps change: jobs of another version are not resumed."""

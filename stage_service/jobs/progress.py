@@ -1,4 +1,4 @@
-"""Progress of a running job: a small file in the model folder, and the way out of a step."""
+"""Progress of a running job: a file in the model folder, and cancellation of a step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from reconstruction import Model
 from stage_service.jobs.records import JobProgress
 
 EVERY_S = 0.2
-"""A step's progress is written, and whether it must stop is asked, at most this often."""
+"""Shortest interval between two writes of a step's progress, each with a check for cancellation."""
 
 
 class JobInterrupted(BaseException):
@@ -21,14 +21,13 @@ class JobCancelled(JobInterrupted):
 
 
 class WorkerStopping(JobInterrupted):
-    """The worker was asked to stop; the next worker takes the job up at this step."""
+    """The worker is stopping; the next worker resumes the job at this step."""
 
 
 class StepProgress:
-    """The `Progress` callback of one step: tells readers, and raises when the step must stop.
+    """The `Progress` callback of one step: writes its progress, and raises when it must stop.
 
-    The share that is told never goes back, though a step may learn that it has more to do.
-    `interrupted` returns the exception to raise, if any.
+    The written share never decreases. `interrupted()` returns the exception to raise, or None.
     """
 
     def __init__(
@@ -64,12 +63,12 @@ class StepProgress:
             share=(done + step_share) / len(self._steps),
             step_share=step_share,
         )
-        told = {"job": self._job, **progress.model_dump(mode="json")}
-        self._model.write_json("progress.json", told, durable=False)  # five times a second
+        data = {"job": self._job, **progress.model_dump(mode="json")}
+        self._model.write_json("progress.json", data, durable=False)  # five times a second
 
 
 def read_progress(model: Model, job: str) -> JobProgress | None:
-    """What `job` last said of this model, or None where it said nothing that can be read."""
+    """The newest progress of `job` in this model, or None."""
     try:
         data = model.json("progress.json")
         return JobProgress(**data) if data.pop("job") == job else None

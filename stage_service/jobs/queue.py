@@ -52,27 +52,24 @@ _STATES: dict[str, tuple[JobState, JobOutcome | None]] = {
 
 
 CONNECT_S = 5
-"""A PostgreSQL server that has not taken the connection by then counts as down."""
+"""Connection time-out of a PostgreSQL server."""
 SILENT_S = 20
-"""One that has not acknowledged what was sent by then, too."""
+"""Time-out of its acknowledgements."""
 STATEMENT_S = 8
-"""The service waits no longer for an answer; a worker has the time."""
-
-
+"""Time-out of the service's statements; a worker's have none."""
 UNANSWERED_S = 10.0
-"""One that has left a request without an answer for so long is asked nothing more until it has
-answered that: each request would keep a thread."""
+"""While a request has had no response for this long, no other is sent: each blocks a thread."""
 CAUSE = "the job database"
-"""As the log names what is wrong with it."""
+"""The cause in the log."""
 LIBRARIES = Folded(
     log, CAUSE, {"dbos", "sqlalchemy"}, {"psycopg", "sqlalchemy", "sqlite3", "connection"}
 )
-"""They log each failure of each of their threads, with tracebacks: 130 lines a second."""
+"""They log each failure of each thread, with tracebacks: 130 lines per second."""
 _RAISED = re.compile(r"^(\([a-z_0-9.]+\.\w+\)|DBOS Error \d+:) ")
-"""The class of an error, which SQLAlchemy or DBOS puts in front of its sentence."""
+"""The class of an error, a prefix by SQLAlchemy or DBOS."""
 _CONNECTION = re.compile(r"^connection .* failed: (FATAL: +)?")
-"""What libpq puts in front of why there is no connection."""
-_MEANWHILE = "Captures and blackout go on; jobs begin again by themselves when it is back."
+"""The prefix by libpq of a failed connection."""
+_MEANWHILE = "Captures and blackout work meanwhile; jobs resume by themselves once it is back."
 
 
 class NoSuchJob(LookupError):
@@ -80,13 +77,13 @@ class NoSuchJob(LookupError):
 
 
 class JobsUnavailable(RuntimeError):
-    """The job database does not answer, or not usefully."""
+    """The job database does not respond, or cannot be used."""
 
 
 def database_url(root: Path, statement_s: float | None = None) -> str:
-    """Where the queue lives: `HAIRSTAGE_DATABASE_URL` (PostgreSQL), else SQLite in `root`.
+    """The queue's database: `HAIRSTAGE_DATABASE_URL` (PostgreSQL), else SQLite in `root`.
 
-    Of a PostgreSQL server each statement has `statement_s` seconds. What the URL says itself holds.
+    `statement_s` is PostgreSQL's statement time-out. Parameters in the URL take precedence.
     """
     url = os.environ.get("HAIRSTAGE_DATABASE_URL")
     if not url:
@@ -108,7 +105,7 @@ def database_url(root: Path, statement_s: float | None = None) -> str:
 
 @dataclass(frozen=True)
 class Waiting:
-    """How many jobs wait, how many run, and how long the first of those that wait has."""
+    """Numbers of queued and running jobs, and how long the oldest queued one has waited."""
 
     queued: int
     running: int
@@ -116,16 +113,15 @@ class Waiting:
 
 
 def new_job_id() -> str:
-    """An id that no other job has, and that sorts by time."""
+    """A unique id that sorts by time."""
     return f"job-{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
 
 
 class JobQueue:
     """Enqueue, read and cancel jobs; works whether or not a worker is running.
 
-    Constructing connects to nothing. Every call does where that is still to be done, and raises
-    `JobsUnavailable` while the database does not answer; `problem` is why, or None. A SQLite file
-    that is broken is renamed; a new one takes its place, and `set_aside` says so.
+    Constructing connects to nothing; calls connect if needed and raise `JobsUnavailable` while the
+    database does not respond. A broken SQLite file is renamed and replaced; `set_aside` reports it.
     """
 
     def __init__(self, root: Path, *, gpu_workers: bool = False) -> None:
@@ -134,12 +130,12 @@ class JobQueue:
         self._client: DBOSClient | None = None
         self._names: Namespace | None = None
         self._problem: str | None = None
-        self._calls: dict[object, float] = {}  # since when each waits for the database
+        self._calls: dict[object, float] = {}  # start of each request under way
         self.set_aside: str | None = None
 
     @property
     def names(self) -> Namespace:
-        """What this root's jobs are called in a database that other roots may share."""
+        """This root's names in a database that other roots may share."""
         if self._names is None:
             self._root.mkdir(parents=True, exist_ok=True)
             self._names = Namespace(self._root)
@@ -147,7 +143,7 @@ class JobQueue:
 
     @property
     def problem(self) -> str | None:
-        """Why it cannot be used, as a sentence for operators; None where it can be."""
+        """Why the database cannot be used, as a sentence; None if it can."""
         return self._silence() or self._problem
 
     def connect(self) -> None:
@@ -156,7 +152,7 @@ class JobQueue:
             pass
 
     def close(self) -> None:
-        """Let go of the database; one that is still being connected to is left to the process."""
+        """Disconnect; waits at most 1 s for a connection that is being opened."""
         if self._lock.acquire(timeout=1.0):
             client, self._client = self._client, None
             self._lock.release()
@@ -164,7 +160,7 @@ class JobQueue:
                 client.destroy()
 
     def submit(self, request: PipelineRequest, capture: Path, model: Model, *, job: str) -> Job:
-        """Put a job on the queue; where there is a job of this id already, return that one."""
+        """Enqueue a job, or return the existing job of this id."""
         spec = {
             "pipeline": request.name,
             "capture": self._stored(capture),
@@ -200,19 +196,19 @@ class JobQueue:
         return [self._job(w) for w in found]
 
     def several(self, jobs: Collection[str]) -> list[Job]:
-        """Those of these jobs that there are, in any order."""
+        """Those of these jobs that exist, in any order."""
         with self._database() as client:
             found = client.list_workflows(workflow_ids=[self.names.workflow(job) for job in jobs])
         return [self._job(w) for w in found]
 
     def ids(self) -> set[str]:
-        """Of every job that there is."""
+        """The ids of all jobs."""
         with self._database() as client:
             found = client.list_workflows(name=WORKFLOW, load_input=False, load_output=False)
         return {self.names.job(w.workflow_id) for w in found}
 
     def waiting(self) -> Waiting:
-        """How many jobs wait and run, and for how long the first of them has."""
+        """Counts of jobs that are not done."""
         going = ["PENDING", "ENQUEUED", "DELAYED"]
         with self._database() as client:
             found = client.list_workflows(
@@ -223,7 +219,7 @@ class JobQueue:
         return Waiting(len(queued), len(found) - len(queued), max(0.0, oldest))
 
     def executors(self) -> set[str]:
-        """The names of the workers that have jobs under way, the dead ones' too."""
+        """The names of the workers with running jobs, dead ones included."""
         with self._database() as client:
             found = client.list_workflows(
                 name=WORKFLOW, status="PENDING", load_input=False, load_output=False
@@ -231,7 +227,7 @@ class JobQueue:
         return {w.executor_id for w in found if w.executor_id is not None}
 
     def at_work_on(self, model: Model) -> str | None:
-        """The id of a job, queued or running, that makes this model."""
+        """The id of a queued or running job that writes this model."""
         path = self._stored(model.path)
         with self._database() as client:
             for state in ("PENDING", "ENQUEUED", "DELAYED"):
@@ -248,24 +244,24 @@ class JobQueue:
         return self.get(job)
 
     def cancelled(self, job: str) -> bool:
-        """Whether the job was cancelled: what a running step asks."""
+        """Whether the job was cancelled."""
         ids = [self.names.workflow(job)]
         with self._database() as client:
             found = client.list_workflows(workflow_ids=ids, load_input=False, load_output=False)
         return bool(found) and found[0].status == "CANCELLED"
 
     def path(self, stored: str) -> Path:
-        """Where a capture or model of a job lies on this machine."""
+        """The path of a job's capture or model on this machine."""
         return self._root.resolve() / stored
 
     def _stored(self, path: Path) -> str:
-        """A path as jobs keep it: inside the root, relative to it, wherever that is mounted."""
+        """A path as jobs store it: relative to the root where it is inside."""
         path, root = path.resolve(), self._root.resolve()
         return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
     @contextmanager
     def _database(self) -> Iterator[DBOSClient]:
-        """The open database; whatever it raises is `JobsUnavailable`."""
+        """The open database; any error becomes `JobsUnavailable`."""
         if (silent := self._silence()) is not None:
             CAUSES.failed(log, CAUSE, silent)
             raise JobsUnavailable(silent)
@@ -291,20 +287,20 @@ class JobQueue:
         CAUSES.over(log, CAUSE)
 
     def _silence(self) -> str | None:
-        """Why nothing more is asked now; None where it may be."""
+        """Why no request may be sent now; None if one may."""
         waits = time.monotonic() - min(list(self._calls.values()), default=math.inf)
         if waits < UNANSWERED_S:
             return None
-        return self._sentence(f"a request has had no answer for {waits:.0f} s")
+        return self._sentence(f"a request has had no response for {waits:.0f} s")
 
     def _sentence(self, reason: str) -> str:
-        """What is wrong, for operators."""
+        """A sentence for operators."""
         url = make_url(database_url(self._root))
         if url.get_backend_name() == "sqlite":
             return f"The job database {url.database} cannot be used: {reason}. {_MEANWHILE}"
         host = url.host or url.query.get("host") or "this machine"
         port = url.port or url.query.get("port") or 5432
-        return f"The job database at {host}:{port} does not answer: {reason}. {_MEANWHILE}"
+        return f"The job database at {host}:{port} does not respond: {reason}. {_MEANWHILE}"
 
     def _open(self) -> DBOSClient:
         names = self.names
@@ -312,7 +308,7 @@ class JobQueue:
         url = database_url(self._root, STATEMENT_S)
         if url.startswith("sqlite:///"):
             file = Path(url.removeprefix("sqlite:///"))
-            # Service and worker may find the same broken file at the same time.
+            # Service and worker may open a broken file at the same time.
             with file.with_suffix(".lock").open("a") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 self.set_aside = set_aside_if_broken(file)
@@ -324,7 +320,7 @@ class JobQueue:
             serializer=DBOSPortableJSONSerializer(),
             application_name=names.application,
             retry_connection_errors=False,
-            observability_query_timeout_sec=STATEMENT_S,  # of lists, which have one of their own
+            observability_query_timeout_sec=STATEMENT_S,  # of lists
         )
 
     def _job(self, status: WorkflowStatus) -> Job:
@@ -332,12 +328,10 @@ class JobQueue:
         spec: dict[str, Any] = status.input["args"][0]
         state, outcome = _STATES[status.status]
         error, job = None, self.names.job(status.workflow_id)
-        # In milliseconds, of which SQLite's clock tells whole seconds.
+        # Milliseconds; SQLite's clock has a resolution of 1 s.
         deadline, end = status.workflow_deadline_epoch_ms, status.completed_at
         if status.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
-            error = JobError(
-                type="WorkerDied", detail="the worker died on this job again and again"
-            )
+            error = JobError(type="WorkerDied", detail="its worker died repeatedly: see its log")
         elif status.status == "CANCELLED" and deadline and end and end > deadline - 1000:
             limit = (status.workflow_timeout_ms or 0) / 1000
             outcome, detail = "failed", f"it took longer than its timeout_s of {limit:g} s"
@@ -366,7 +360,7 @@ class JobQueue:
 
 
 def _reason(error: Exception) -> str:
-    """Why, in the database's own words, without those of the libraries in between."""
+    """The database's own message, without the libraries' prefixes."""
     said = _CONNECTION.sub("", _RAISED.sub("", _first_line(error))).strip().rstrip(".")
     if "statement timeout" in said:
         return f"a request took longer than {STATEMENT_S} s"

@@ -1,4 +1,4 @@
-"""What a job is, as everyone outside the worker sees it."""
+"""Jobs and their requests, as everything outside the worker has them."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ JobOutcome = Literal["succeeded", "failed", "cancelled"]
 
 
 def with_example(**fields: Any) -> ConfigDict:
-    """Frozen, without other fields, and with an example of them in the schema."""
+    """Frozen, no other fields, and an example in the schema."""
     return ConfigDict(extra="forbid", frozen=True, json_schema_extra={"examples": [fields]})
 
 
 class JobOptions(Strict):
-    """What a pipeline may be told; every field has a default that works.
+    """Options of a pipeline.
 
-    `held_out_cameras` and `held_out_lights` name what neither reconstruction nor fit may observe:
-    the images of these are what the result is judged on. `truth` is a strand file to evaluate
-    against, or a folder with `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr`
-    file, `studio` or `sky`. `reduced` by n, every step works on means over n × n pixels: large
-    pictures need a fraction of time and memory. `reconstruct`, `fit`, `inverse_rendering`, `fields`
-    and `assess` go to the step of that name.
+    `held_out_cameras` and `held_out_lights` are excluded from reconstruction and fit; their images
+    validate the result. `truth` is a strand file to evaluate against, or a folder with
+    `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr` file, `studio` or `sky`.
+    With `reduced` n every step works on means over n × n pixels. `reconstruct`, `fit`,
+    `inverse_rendering`, `fields` and `assess` are the options of the step of that name.
     """
 
     method: Method = "light_planes"
@@ -50,21 +49,21 @@ class JobOptions(Strict):
 
     @field_validator("reconstruct")
     @classmethod
-    def _said_once(cls, asked: ReconstructOptions) -> ReconstructOptions:
-        if asked.held_out or asked.seed:
-            raise ValueError("held_out and seed are the job's: held_out_cameras and seed")
-        return asked
+    def _job_options_alone(cls, options: ReconstructOptions) -> ReconstructOptions:
+        if options.held_out or options.seed:
+            raise ValueError("set the job's held_out_cameras and seed instead of held_out and seed")
+        return options
 
     def to_dict(self) -> dict[str, Any]:
-        """What differs from the defaults, as JSON."""
+        """The options that differ from the defaults, as JSON."""
         return self.model_dump(mode="json", exclude_defaults=True)
 
 
 class PipelineRequest(Strict):
-    """Which pipeline to run, and with which options.
+    """A pipeline to run, and its options.
 
-    Of the jobs that wait, the one of the lowest `priority` goes first. A step that fails is tried
-    again `retries` times; a job that has run for `timeout_s` seconds, waiting not counted, fails.
+    The queued job of the lowest `priority` runs first. A failed step is retried `retries` times; a
+    job fails after running for `timeout_s` seconds.
     """
 
     name: Annotated[str, Field(json_schema_extra={"enum": sorted(PIPELINES)})]
@@ -87,7 +86,7 @@ class PipelineRequest(Strict):
 
 
 class JobProgress(Strict):
-    """How far a job is: `share` of the whole job and `step_share` of this step, 0 to 1."""
+    """A job's progress: `share` of the whole job and `step_share` of this step, 0 to 1."""
 
     step: str
     steps: tuple[str, ...]
@@ -106,8 +105,7 @@ class JobError(Strict):
 class Job(BaseModel):
     """One run of a pipeline. `outcome` is set exactly when `state` is `done`; times are UTC.
 
-    `options` are those that were asked for, defaults left out; `priority`, `retries` and
-    `timeout_s` are the request's.
+    `options` are the request's, without defaults; so are `priority`, `retries` and `timeout_s`.
     """
 
     model_config = with_example(

@@ -1,4 +1,4 @@
-"""Names: of a root folder in a job database that others may share, and of its workers."""
+"""Names of a root folder and its workers in a job database that other roots may share."""
 
 from __future__ import annotations
 
@@ -18,16 +18,13 @@ from reconstruction.reading import printable
 
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:60] or "host"
 BEAT_S = 1.0
-"""How often a worker says that it is there."""
+"""Interval of a worker's heartbeat."""
 SILENT_S = 30.0
-"""A worker of another machine that has said nothing for so long counts as gone."""
+"""A worker of another machine without a heartbeat for this long counts as gone."""
 
 
 class Namespace:
-    """What belongs to one root folder, named so that no other root means the same by it.
-
-    The root's own name lies in it (`jobs.id`), and so is the same on every machine that mounts it.
-    """
+    """Unique names for one root folder, from its `jobs.id`, on every machine that mounts it."""
 
     def __init__(self, root: Path) -> None:
         file = root / "jobs.id"
@@ -41,15 +38,15 @@ class Namespace:
         self.application = f"hairstage-{self._id}"
 
     def version(self, steps: str) -> str:
-        """What the database calls a version of the pipelines' steps."""
+        """The database's name of a version of the pipelines' steps."""
         return f"{self.application}-{steps}"
 
     def queue(self, gpu: bool) -> str:
-        """The queue of the workers with, or without, a GPU of their own."""
+        """The queue of the workers with, or without, a GPU."""
         return f"{self.application}-{'gpu' if gpu else 'jobs'}"
 
     def workflow(self, job: str) -> str:
-        """A job's id as the database has it."""
+        """A job's id in the database."""
         return f"{self._id}:{job}"
 
     def job(self, workflow: str) -> str:
@@ -57,15 +54,15 @@ class Namespace:
         return workflow.removeprefix(f"{self._id}:")
 
     def executor(self, worker: WorkerSlot) -> str:
-        """A worker's name as the database has it; no other process has the same."""
+        """A worker's unique name in the database."""
         return f"{self._id}/{worker.host}/{worker.name}"
 
 
 class WorkerSlot:
-    """A worker's name among those of one root on one machine: the first whose lock file is free.
+    """A worker's name, unique among one root's on one machine: the first with a free lock file.
 
-    The kernel frees the lock when the process dies, however it dies. The next worker then gets the
-    dead one's name, and with it the jobs that it left.
+    The kernel frees the lock when the process dies. The next worker takes the dead one's name, and
+    with it its jobs.
     """
 
     host = HOST
@@ -79,17 +76,17 @@ class WorkerSlot:
         self.beat()
 
     def beat(self) -> None:
-        """Say that it is there."""
+        """Update the heartbeat."""
         os.utime(self._file.fileno())
 
     def release(self) -> None:
-        """Give the name up before the process ends."""
+        """Release the name before the process ends."""
         self._file.close()
 
 
 @dataclass(frozen=True)
 class WorkerStatus:
-    """A worker of this root: `age_s` since it last said that it is there."""
+    """A worker of this root; `age_s`: seconds since its last heartbeat."""
 
     host: str
     name: str
@@ -98,7 +95,7 @@ class WorkerStatus:
 
 
 def worker_statuses(root: Path) -> list[WorkerStatus]:
-    """Every worker that this root has had, on whatever machine."""
+    """Every worker that this root has had, on any machine."""
     found = []
     for path in sorted(root.glob("worker-*.lock")):
         name, _, host = path.stem.partition("@")
@@ -106,7 +103,7 @@ def worker_statuses(root: Path) -> list[WorkerStatus]:
         alive = age < SILENT_S
         if host == HOST:
             with suppress(PermissionError):  # another user's: by its heartbeat
-                # Shared, so that several may look at once.
+                # A shared lock, so that several processes may check at once.
                 file = _hold(path, fcntl.LOCK_SH)
                 alive = file is None
                 if file is not None:
@@ -116,8 +113,8 @@ def worker_statuses(root: Path) -> list[WorkerStatus]:
 
 
 def hold_dead(root: Path, executor: str) -> IO[str] | None:
-    """The lock of a dead worker of this machine, by its name in the database; None where it lives
-    or is of another machine. Nobody gets its name until the file is closed."""
+    """Lock the name of a dead worker of this machine, by its name in the database; None where it
+    lives or is of another machine. Closing the file releases the name."""
     _, host, name = executor.split("/") if executor.count("/") == 2 else ("", "", "")
     return _hold(_file(root, host, name)) if host == HOST else None
 

@@ -1,4 +1,4 @@
-"""The job queue's SQLite file: one that is broken is put aside, and said to be."""
+"""The job queue's SQLite file: a broken one is renamed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ log = logging.getLogger("hairstage.jobs")
 
 
 def set_aside_if_broken(file: Path) -> str | None:
-    """Rename a SQLite file, and what belongs to it, that is none or damaged; says what was done."""
+    """Rename a damaged SQLite file with its side files; returns a sentence if it did."""
     if not file.exists():
         return None
     reason = _broken(file)
@@ -23,24 +23,24 @@ def set_aside_if_broken(file: Path) -> str | None:
         part = file.with_name(file.name + suffix)
         if part.exists():
             part.rename(file.with_name(aside + suffix))
-    told = (
-        f"{file} was broken ({reason}) and was set aside as {aside}: its jobs are lost. "
-        "Models that were begun stay as they are: restart workers, and ask for jobs anew"
+    problem = (
+        f"{file} was broken ({reason}) and was renamed to {aside}: its jobs are lost. Unfinished "
+        "models are kept as they are: restart the workers and submit the jobs again"
     )
-    log.error("%s", told)
-    return told
+    log.error("%s", problem)
+    return problem
 
 
 def _broken(file: Path) -> str | None:
-    """What is wrong with a SQLite file; None where it is sound, or another uses it just now."""
+    """What is wrong with a SQLite file; None if it is sound, or in use."""
     try:
         with closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True, timeout=30)) as database:
             (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master")}
-    except sqlite3.OperationalError:  # locked, or not to be opened: what follows says so
+    except sqlite3.OperationalError:  # locked, or not readable: the next access reports it
         return None
     except sqlite3.DatabaseError as error:
         return str(error)
     if found != "ok":
         return str(found)
-    return None if not tables or "dbos_migrations" in tables else "it is another program's"
+    return None if not tables or "dbos_migrations" in tables else "it belongs to another program"

@@ -1,8 +1,7 @@
-"""The steps that pipelines are made of.
+"""The steps of pipelines.
 
-A step reads its input from the capture and model folders and leaves its results in the model
-folder; what it returns is small and JSON-ready. A step that is run again from its beginning (after
-a crash) writes the same files again.
+A step reads the capture and model folders and writes its results to the model folder; its return
+value is small and JSON-ready. After a crash a step runs again and writes the same files.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True)
 class StepContext:
-    """What a step works on; `previous` holds what the job's earlier steps returned, by name."""
+    """A step's input; `previous` has the return values of the job's earlier steps, by name."""
 
     capture: Path
     model: Model
@@ -29,20 +28,20 @@ class StepContext:
     previous: Mapping[str, Figures] = field(default_factory=dict)
 
     def frames(self) -> Capture:
-        """The capture, its pictures as large as was asked for."""
+        """The capture, its images reduced as requested."""
         return Capture(self.capture).view(reduced=self.options.reduced)
 
     def for_appearance(self) -> dict[str, Any]:
-        """What fits and assessment of the appearance take alike."""
+        """The arguments that the appearance's fits and assessment share."""
         from appearance import HeldOut
 
-        asked = self.options
+        options = self.options
         return {
             "capture": self.frames(),
             "model": self.model,
-            "held_out": HeldOut(asked.held_out_cameras, asked.held_out_lights),
+            "held_out": HeldOut(options.held_out_cameras, options.held_out_lights),
             "progress": self.progress,
-            "seed": asked.seed,
+            "seed": options.seed,
         }
 
 
@@ -59,10 +58,10 @@ def reconstruct(context: StepContext) -> Figures:
     """Strands from the capture: `strands.npz`, `strands.hair`, `strands.usdc`, `points.npz`."""
     from reconstruction import reconstruct as run
 
-    asked = context.options
-    options = replace(asked.reconstruct, held_out=asked.held_out_cameras, seed=asked.seed)
-    capture = context.frames().without_lights(asked.held_out_lights)
-    run(capture, context.model, method=asked.method, options=options, progress=context.progress)
+    job = context.options
+    options = replace(job.reconstruct, held_out=job.held_out_cameras, seed=job.seed)
+    capture = context.frames().without_lights(job.held_out_lights)
+    run(capture, context.model, method=job.method, options=options, progress=context.progress)
     return {"strands": "strands.npz"}
 
 
@@ -77,8 +76,8 @@ def fit(context: StepContext) -> Figures:
 def inverse_rendering(context: StepContext) -> Figures:
     """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`.
 
-    Discarded if Sun's fit is better on frames that neither was fitted to. The message of its
-    progress holds the current error. Killed, it resumes from its checkpoint.
+    Discarded if Sun's fit is better on frames that neither was fitted to. If killed, it resumes
+    from its checkpoint.
     """
     from appearance import fit_validated as run
 
@@ -88,8 +87,8 @@ def inverse_rendering(context: StepContext) -> Figures:
 def fields(context: StepContext) -> Figures:
     """A field of reflectance on top of the material: `field.npz`.
 
-    Discarded if images that it was not fitted to are better without it. Killed, it resumes after
-    the last view that was done.
+    Discarded if images that it was not fitted to are better without it. If killed, it resumes after
+    the last finished view.
     """
     from appearance import fit_field_validated as run
 
@@ -100,13 +99,12 @@ def assess(context: StepContext) -> Figures:
     """Held-out images beside the captured ones, and a relit picture."""
     from appearance import assess as run
 
-    asked = context.options
-    return run(**context.for_appearance(), environment=asked.environment, options=asked.assess)
+    job = context.options
+    return run(**context.for_appearance(), environment=job.environment, options=job.assess)
 
 
 def evaluate(context: StepContext) -> Figures:
-    """Strands against true ones, beside two baselines that use no method; appearance too, where
-    the truth is a folder that has it."""
+    """Strands and baselines against the truth; appearance too, if the truth is a folder with it."""
     if context.options.truth is None:
         return {"left_out": "no truth was given"}
     from stage_service.jobs.evaluation import evaluate_appearance, evaluate_geometry

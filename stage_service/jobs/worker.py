@@ -1,7 +1,7 @@
 """The worker process: takes jobs off the queue and runs their steps.
 
-DBOS checkpoints every step, so a worker that dies (SIGKILL included) leaves a job that the next
-worker takes up at the step that was under way. Steps keep bulk data in the model folder.
+DBOS checkpoints every step: after a worker's death, SIGKILL included, the next worker resumes its
+jobs at the step that was under way.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from stage_service.stopping import Ending, Step, end_all
 log = logging.getLogger("hairstage.worker")
 
 CANCEL_S = 10.0
-"""A cancelled step that has not stopped by then, deep in native code, ends with its process."""
+"""A cancelled step that has not stopped by then, as in native code, ends with its process."""
 MOST_ATTEMPTS = 20
-"""A job whose worker died, or was stopped, this often is given up."""
+"""A job fails after its worker died or was stopped this often."""
 DATABASE_S = 3.0
-"""A job database that does not answer keeps a worker that is to stop for no longer."""
+"""Seconds that a stopping worker waits for the job database."""
 LOOK_S = 5.0
-"""How often a worker looks whether another has died on a job."""
-LOOKING = "looking after other workers"
-"""As the log names what is wrong with that."""
+"""Interval at which a worker checks for dead ones."""
+LOOKING = "checking for dead workers"
+"""The cause in the log."""
 RETRY_S = 5.0
-"""How long a step that failed waits before it is tried again."""
+"""Seconds before a failed step is retried."""
 
 
 class Worker:
-    """Runs the steps of jobs, at most `concurrency` at a time, until it is told to stop."""
+    """Runs the steps of jobs, at most `concurrency` at a time, until `stop`."""
 
     def __init__(self, root: Path, concurrency: int) -> None:
         self.queue = JobQueue(root)
@@ -56,13 +56,12 @@ class Worker:
         self.slot = WorkerSlot(root)
         self._root = root
         self._stopping = threading.Event()
-        # A cancelled job leaves DBOS's count at once, but its thread only at its next progress
-        # call: this keeps the next job from running beside it.
+        # DBOS no longer counts a cancelled job, whose thread runs until its next progress call.
         self._slots = threading.BoundedSemaphore(concurrency)
         self._under_way: set[str] = set()
 
     def stop(self) -> None:
-        """Make running steps stop at their next progress call, for another worker to take up."""
+        """Stop running steps at their next progress call; another worker resumes them."""
         self._stopping.set()
 
     def run_job(self, spec: dict[str, Any]) -> dict[str, Any]:
@@ -104,7 +103,7 @@ class Worker:
         return {"seconds": seconds, "figures": figures}
 
     def _tried(self, context: StepContext, step: str, job: str, retries: int) -> Any:
-        """What the step returns, of the first of `1 + retries` tries that does not fail."""
+        """The result of the first of `1 + retries` tries that does not fail."""
         while True:
             try:
                 context.progress(step, 0.0)
@@ -115,26 +114,26 @@ class Worker:
                 if retries == 0:
                     raise
                 retries -= 1
-                log.exception("%s: %s failed, and is tried again", job, step)
+                log.exception("%s: %s failed and is retried", job, step)
             until = time.monotonic() + RETRY_S
             while time.monotonic() < until:
-                context.progress(f"{step} failed, and is tried again", 0.0)
+                context.progress(f"{step} failed and is retried", 0.0)
                 time.sleep(RETRY_S / 20)
 
     def look_after(self, take_over: str | None = None) -> None:
-        """Say that this worker is there, and take up the jobs of others of this root that are not:
-        those of this machine, and all of the machine `take_over`, which is known to be dead."""
-        looked = 0.0
+        """Send heartbeats, and resume the jobs of this root's dead workers on this machine, and of
+        all workers on the machine `take_over`, which is known to be dead."""
+        checked = 0.0
         while not self._stopping.wait(BEAT_S):
             try:
                 self.slot.beat()
-                if time.monotonic() - looked > LOOK_S:
-                    looked = time.monotonic()
+                if time.monotonic() - checked > LOOK_S:
+                    checked = time.monotonic()
                     self._take_up(take_over)
                 CAUSES.over(log, LOOKING)
             except JobsUnavailable:  # which the queue has logged
                 pass
-            except Exception as error:  # for a while
+            except Exception as error:
                 CAUSES.failed(log, LOOKING, error, None if isinstance(error, OSError) else error)
 
     def _take_up(self, take_over: str | None) -> None:
@@ -143,16 +142,16 @@ class Worker:
             if dead is None and executor.split("/")[1:2] != [take_over]:
                 continue
             try:
-                log.warning("%s is dead: its jobs are taken up", executor)
+                log.warning("%s is dead: its jobs are resumed", executor)
                 DBOS._recover_pending_workflows([executor])
             finally:
                 if dead is not None:
                     dead.close()
 
     def watch(self) -> None:
-        """Start the process anew, in its place, once a cancelled step has not stopped in time.
+        """Restart the process in place once a cancelled step has not stopped in time.
 
-        Other jobs of this worker go on at the step that they were at.
+        Other jobs of this worker resume at their present step.
         """
         since: dict[str, float] = {}
         while not self._stopping.wait(CANCEL_S / 10):
@@ -161,18 +160,16 @@ class Worker:
             late = [job for job in going if isinstance(self._interrupted(job), JobCancelled)]
             since = {job: since.get(job, now) for job in late}
             if any(now - begun > CANCEL_S for begun in since.values()):
-                log.warning(
-                    "%s: cancelled, and not stopped: the worker starts anew", ", ".join(late)
-                )
+                log.warning("%s: cancelled, not stopped: the worker restarts", ", ".join(late))
                 logging.shutdown()
                 os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
     def _interrupted(self, job: str) -> JobInterrupted | None:
         if self._stopping.is_set():
-            return WorkerStopping("the worker was asked to stop")
+            return WorkerStopping("the worker is stopping")
         try:
             return JobCancelled(job) if self.queue.cancelled(job) else None
-        except JobsUnavailable:  # the database is away for a while: the step's work is not lost
+        except JobsUnavailable:  # the step continues
             return None
 
 
@@ -184,17 +181,17 @@ def run_worker(
     take_over: str | None = None,
     ready: Callable[[str], None] = lambda _name: None,
 ) -> None:
-    """Serve a queue of `root` until SIGTERM or SIGINT; `ready` is told this worker's name.
+    """Serve a queue of `root` until SIGTERM or SIGINT; `ready` is called with this worker's name.
 
-    With `gpu` it is that of jobs which render, for a service that knows of such workers.
-    `take_over` is a machine of this root that is dead: what its workers left is taken up. Ends the
-    process: a step under way is left to the next worker.
+    With `gpu` the queue of jobs that render, for a service with `gpu_workers`. `take_over` is a
+    dead machine of this root, whose workers' jobs are resumed. Ends the process; the next worker resumes
+    a step under way.
     """
     worker = Worker(root, concurrency)
     names = worker.queue.names
-    # A handler of its own would not log as ours do, and would not know of causes.
+    # Instead of DBOS's own handler, which has another format and repeats causes.
     logging.getLogger("dbos").addHandler(logging.NullHandler())
-    logging.getLogger("dbos").addFilter(_not_told_twice)
+    logging.getLogger("dbos").addFilter(_not_repeated)
     DBOS(
         config={
             "name": names.application,
@@ -211,7 +208,7 @@ def run_worker(
         return worker.run_job(spec)
 
     stop = taken(signal.SIGTERM, signal.SIGINT)
-    # From here on: what follows may hang with the database, and must not keep it from ending.
+    # Before the database is used, which may hang.
     ends = threading.Thread(target=_end, args=(worker, stop), name="stop", daemon=True)
     ends.start()
     queue = names.queue(gpu)
@@ -225,8 +222,8 @@ def run_worker(
 
 
 def _end(worker: Worker, stop: Callable[[], None]) -> None:
-    """End this process once `stop` returns. Step threads may be deep in native code; they hold
-    nothing that the next worker needs."""
+    """End this process once `stop` returns. Step threads may be in native code and are not waited
+    for; the next worker needs nothing of theirs."""
     stop()
     left: list[str] = []
     ending = Ending(left)
@@ -235,6 +232,6 @@ def _end(worker: Worker, stop: Callable[[], None]) -> None:
     ending.now()
 
 
-def _not_told_twice(record: logging.LogRecord) -> bool:
+def _not_repeated(record: logging.LogRecord) -> bool:
     """DBOS logs the end of every failed or cancelled job as an error of its own."""
     return not record.getMessage().startswith("Exception encountered in background workflow")

@@ -300,7 +300,7 @@ def test_a_bank_that_was_started_anew_or_is_another_s_is_told_with_the_next_hear
     driver.heartbeat()
     lamps.own(0, [0])  # a power-up, by the wire's page
     lamps.dim(0, [65535] * driver.count)
-    with pytest.raises(DeviceError, match=r"service 7's, received nobody's: it was started anew"):
+    with pytest.raises(DeviceError, match=r"service 7's, received no owner"):
         driver.heartbeat()
     lamps.own(0, [9])
     with pytest.raises(DeviceError, match=r"service 7's, received that of service 9"):

@@ -108,7 +108,7 @@ def test_progress_that_cannot_be_read_is_no_progress(text, tmp_path):
 
 
 WHY = {"down": "Connection refused", "deaf": "connection timeout expired"}
-MEANWHILE = "Captures and blackout go on; jobs begin again by themselves when it is back."
+MEANWHILE = "Captures and blackout work meanwhile; jobs resume by themselves once it is back."
 
 
 def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatch, tmp_path):
@@ -121,7 +121,7 @@ def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatc
             queue = JobQueue(tmp_path)
             with pytest.raises(JobsUnavailable) as refusal:
                 queue.all()
-            place = f"The job database at 127.0.0.1:{port} does not answer"
+            place = f"The job database at 127.0.0.1:{port} does not respond"
             assert str(refusal.value) == queue.problem == f"{place}: {WHY[which]}. {MEANWHILE}"
             queue.close()
 
@@ -155,7 +155,7 @@ def test_a_server_that_is_silent_gets_no_more_requests_until_it_answers(monkeypa
     until(lambda: queue.problem is not None)
     for _ in range(3):
         with pytest.raises(
-            JobsUnavailable, match="cannot be used: a request has had no answer for"
+            JobsUnavailable, match="cannot be used: a request has had no response for"
         ):
             queue.all()
     assert asked == [1]
