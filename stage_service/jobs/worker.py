@@ -181,7 +181,7 @@ def run_worker(
     take_over: str | None = None,
     ready: Callable[[str], None] = lambda _name: None,
 ) -> None:
-    """Serve a queue of `root` until SIGTERM or SIGINT; `ready` is called with this worker's name.
+    """Serve a queue of `root` until SIGTERM or SIGINT; calls `ready` with this worker's name.
 
     With `gpu` the queue of jobs that render, for a service with `gpu_workers`. `take_over` is a
     dead machine of this root, whose workers' jobs are resumed. Ends the process; the next worker resumes

@@ -1,4 +1,4 @@
-"""What to shoot, as REST, CLI and plan files say it; `resolved` is what a rig makes of it."""
+"""What to shoot, as REST, CLI and plan files have it; `resolved` applies it to a rig."""
 
 from __future__ import annotations
 
@@ -33,10 +33,7 @@ class KindLevels(Strict):
 
 
 class Rows(Strict):
-    """Scanlines `first` up to and including `last` (None: the last row).
-
-    Every one of them: a line is found by the lines beside it, so a `step` is 1.
-    """
+    """Scanlines `first` up to and including `last` (None: the last row), with a `step` of 1."""
 
     first: Annotated[int, Field(ge=0, le=MOST_ROWS)] = 0
     last: Annotated[int, Field(ge=0, le=MOST_ROWS)] | None = None
@@ -47,13 +44,13 @@ class CapturePlan(Strict):
     """What to shoot. The order is: dark, all on; each light alone; the sweep; dark, all on.
 
     `brackets` are factors on the exposure of a light alone: all lights at the first factor, then
-    all at the next, so that cameras are armed once for each. `rate_hz` is the most steps a second.
-    `stepping` says who clocks the steps; "auto" lets the trigger box do it where it can. `consent`
-    says who agreed, when, and to what, where a living subject is to see flashes of 3 to 30 Hz.
+    all at the next, so that cameras are armed once for each. `rate_hz` limits the steps per second.
+    `stepping`: the service or the trigger box clocks the steps; "auto" prefers the box. `consent`
+    records who agreed, when, and to what, if a living subject sees flashes of 3 to 30 Hz.
 
-    In the sweep a tracking frame stands before every full group of `tracking_every` scanlines of
-    a projector, floor(rows / tracking_every) of them and at least one: 76 for 768 rows, 6 for 64.
-    The rows that are left over follow the last full group. 0 means no tracking frames.
+    In the sweep a tracking frame precedes every full group of `tracking_every` scanlines of a
+    projector, floor(rows / tracking_every) times and at least once: 76 for 768 rows. The remaining
+    rows follow the last full group. 0: no tracking frames.
     """
 
     lights: Literal["all"] | Names = "all"

@@ -1,4 +1,4 @@
-"""What a plan takes: frames, bytes, seconds, light."""
+"""The cost of a plan: frames, bytes, seconds, light."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from stage_service.config import Strict
 from stage_service.plan.flash import FlashRate
 
 EXR_HEADER_BYTES = 700
-"""What an EXR file holds beside 12 bytes a pixel, not counting its table of lines."""
+"""Bytes of an EXR file beside 12 bytes per pixel and its table of lines."""
 
 
 class LeftOutWork(Strict):
-    """Work that this plan does not need on this rig."""
+    """Steps that this plan omits on this rig."""
 
     what: str
     why: str
@@ -23,14 +23,14 @@ class LeftOutWork(Strict):
 
 
 class PlanCost(Strict):
-    """What a plan takes, retries apart.
+    """The cost of a plan, without retries.
 
-    `frames` counts pictures (steps times cameras), `bytes` what the capture folder gets while
-    shooting, `seconds` includes exposure, settling, readout, link and storage; `limited_by` names
-    what takes most of it. `stepping` counts the steps that the service and the trigger box clock,
-    and `stepping_why` says why. `lamp_seconds` sums level times on-time over lamps; `dose` is the
-    radiant exposure at the head's centre, J/m² per channel, lamps and projectors together. `flash`
-    says how fast it flashes, and whether a living subject must have consented to that.
+    `frames` counts images (steps times cameras), `bytes` is the size of the capture folder while
+    shooting, `seconds` includes exposure, settling, readout, link and storage; `limited_by` is the
+    largest of these. `stepping` counts the steps that the service and the trigger box clock,
+    `stepping_why` is the reason. `lamp_seconds` sums level times on-time over lamps; `dose` is the
+    radiant exposure at the head's centre, J/m² per channel, of lamps and projectors. `flash` is the
+    flash rate, and whether a living subject's consent is required.
     """
 
     steps: int
@@ -49,7 +49,7 @@ class PlanCost(Strict):
 
 
 def folder_bytes(rig: Rig) -> int:
-    """Bytes of one step's frames, as they are written while shooting."""
+    """Bytes of one step's frames, uncompressed."""
     return sum(EXR_HEADER_BYTES + 16 * c.height + 12 * c.width * c.height for c in rig.cameras)
 
 
@@ -58,8 +58,8 @@ def dose_of(
 ) -> tuple[float, tuple[float, float, float]]:
     """Lamp seconds, and radiant exposure at the head's centre, J/m² per channel.
 
-    By the inverse-square law; a light is on `overhead_s` longer than its exposure. A row lights a
-    point for about one row's time: it counts as 1/height of its projector.
+    By the inverse-square law; a light is on `overhead_s` longer than its exposure. A row counts as
+    1/height of its projector.
     """
     lamps = {
         x.name: x.intensity_towards(np.zeros(3)) / (x.position @ x.position) for x in rig.lights

@@ -1,4 +1,4 @@
-"""How fast a plan flashes, and whether a living subject may be in front of it.
+"""The flash rate of a plan, and whether a living subject may be in front of it.
 
 Flashes of 3 to 30 Hz are those that most often set off seizures (Epilepsy Society, "Photosensitive
 epilepsy"); up to three flashes in a second pass (W3C, WCAG 2.2, success criterion 2.3.1).
@@ -16,9 +16,9 @@ from stage_service.plan.timeline import Lit
 
 SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0
 IN_A_ROW = 3
-"""So many intervals of the band within a second, four flashes, are flashing in the band."""
+"""Intervals within a second (of four flashes) that make a rate."""
 SLOW_HZ = 2.5
-"""What is offered as a way out: below the band, with room for steps that come early."""
+"""The suggested rate: below the band, with room for early steps."""
 
 Band = Literal["below 3 Hz", "3 to 30 Hz", "above 30 Hz"]
 IN_BAND: Band = "3 to 30 Hz"
@@ -26,10 +26,10 @@ ROUNDING = 1e-9
 
 
 class FlashRate(Strict):
-    """How fast a plan flashes, as predicted: `hz`, over four flashes in a row, decides the band.
+    """The predicted flash rate: `hz`, over four consecutive flashes, determines the band.
 
-    Retries, a slow link or a slow disk make it slower: what is above the band can fall into it, so
-    the rate is measured while running, too. `by_kind` has how often each kind of step comes again.
+    Retries, a slow link or a slow disk can bring a faster rate into the band, so the rate is
+    measured during the run, too. `by_kind` has the rate of each kind of step.
     """
 
     hz: float
@@ -39,7 +39,7 @@ class FlashRate(Strict):
 
 
 class FlashRefusal(RuntimeError):
-    """A plan that flashes in the band; `problems` has the ways out."""
+    """A plan that flashes in the band; `problems` has the remedies."""
 
     def __init__(
         self, rate: FlashRate, consent: str | None, *, seconds: float, slow_seconds: float
@@ -50,8 +50,8 @@ class FlashRefusal(RuntimeError):
             f"before a living subject, and {lacks}",
             f"either set rate_hz to {SLOW_HZ:g} in the plan, which keeps it below the band and "
             f"takes {slow_seconds:.0f} s instead of {seconds:.0f} s",
-            "or record in the plan's consent who agreed to what and when, and give in armed_by who "
-            "answers for it at the stage",
+            "or record in the plan's consent who agreed to what and when, and name in armed_by the "
+            "person at the stage who is responsible",
             "a mannequin or a simulated subject: set living_subject = false in [safety] of the rig "
             "file",
         ]
@@ -59,7 +59,7 @@ class FlashRefusal(RuntimeError):
 
 
 class _Train:
-    """Flashes of one kind, in time's order; remembers the newest intervals that are in the band."""
+    """Consecutive flashes of one kind, with the newest intervals that are in the band."""
 
     def __init__(self) -> None:
         self._last: float | None = None
@@ -67,7 +67,7 @@ class _Train:
         self._newest: deque[float] = deque(maxlen=IN_A_ROW + 1)
 
     def add(self, at: float) -> float | None:
-        """Take a flash; returns the rate in Hz once it is within the band."""
+        """Add a flash; returns the rate in Hz if it is within the band."""
         before, self._last = self._last, at
         self._newest.append(at)
         if before is None:
@@ -81,24 +81,22 @@ class _Train:
         return IN_A_ROW / (at - self._begins[0])
 
     def rate(self) -> float:
-        """Hz over the newest flashes; 0 while there are too few."""
+        """Hz over the newest flashes; 0 if they are too few."""
         if len(self._newest) <= IN_A_ROW or self._newest[-1] <= self._newest[0]:
             return 0.0
         return IN_A_ROW / (self._newest[-1] - self._newest[0])
 
 
 class Trains:
-    """Every light of the plan as one train, and the full-field flashes among them as another.
-
-    A tracking frame before every tenth scanline outshines them: it flashes at its own rate.
-    """
+    """All lights as one train, and the full-field flashes among them as another: tracking frames are
+    much brighter than scanlines and have a rate of their own."""
 
     def __init__(self) -> None:
         self.each = _Train()
         self._full_field = _Train()
 
     def add(self, step: Step, at: float) -> float | None:
-        """The rate that lies in the band with this flash, or None."""
+        """The rate in the band after this flash, or None."""
         rates = [self.each.add(at)]
         if step.kind in ("tracking", "all_on"):
             rates.append(self._full_field.add(at))
@@ -107,7 +105,7 @@ class Trains:
 
 
 def flash_rate(lights: Iterable[Lit], living_subject: bool) -> FlashRate:
-    """Classify a plan by its predicted course."""
+    """Classify a plan by its predicted timeline."""
     trains, worst, fastest = Trains(), 0.0, 0.0
     kinds, by_kind = dict[str, _Train](), dict[str, float]()
     for lit in lights:

@@ -1,4 +1,4 @@
-"""What `[safety]` lets the lamps do, and what they can: checked before anything is lit."""
+"""`[safety]` limits and levels of a plan: checked before anything is lit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PROJECTORS = PROJECTOR_LEVELS, "projector controller"
 
 
 def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[str]:
-    """One sentence for each limit that the plan exceeds, its worst case; retries apart."""
+    """One sentence for each limit that the plan exceeds, its worst case; without retries."""
     steps = [x for x in lights if x.step.kind in ("olat", "all_on")]
     if not steps:
         return []
@@ -47,8 +47,7 @@ def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[
 
 
 def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
-    """One sentence for each kind of step whose level the light bank would make another, or the
-    projectors darkness."""
+    """One sentence for each kind of step whose level the device would round to another, or to 0."""
     problems = {}
     for part in parts:
         lamps = bank.level_steps(by_table=part.stepping == "hardware")
@@ -60,7 +59,7 @@ def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
             what = f"level.{step.kind}: the {who}"
             if steps == 1 and step.level != 1:
                 problems[step.kind] = (
-                    f"{what} has no levels, its lamps are at 1; {step.level:g} was asked for"
+                    f"{what} has no levels: its lamps are at 1, not at {step.level:g}"
                 )
             elif round(step.level * steps) == 0:
                 problems[step.kind] = (
@@ -88,10 +87,10 @@ def _check_duty(steps: Sequence[Lit], rig: Rig, limits: SafetyLimits) -> list[st
 
 
 def longest_on(spans: Sequence[tuple[float, float]], window: float) -> float:
-    """The most seconds that `spans`, in order and apart, have within any `window` seconds.
+    """The most seconds of `spans`, ordered and disjoint, within any window of `window` seconds.
 
-    Some best window begins where a span begins, or ends where one ends; one that ends with a span
-    is tried for every span, one that begins with a span by the mirrored course.
+    A best window ends with a span, or begins with one: the latter is the former of the mirrored
+    spans.
     """
     mirrored = [(-end, -begin) for begin, end in reversed(spans)]
     return max(_ending_with_a_span(spans, window), _ending_with_a_span(mirrored, window))

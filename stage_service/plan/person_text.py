@@ -1,7 +1,7 @@
-"""What people write about themselves: names and sentences that read as what they are.
+"""Checks of names and sentences that people type in.
 
-A name is shown to others as who steers, who has looked, who answers for flashes. Characters that do
-not show, or that change how what stands beside them reads, would let it pass for another's.
+A name is shown to others as who steers, has looked, or armed flashes. Invisible characters, and those
+that reorder text, would let it look like another person's.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from pydantic import AfterValidator
 
 UNSEEN = {0x034F, 0x115F, 0x1160, 0x17B4, 0x17B5, *range(0x180B, 0x1810), 0x2800, 0x3164, 0xFFA0}
 UNSEEN |= {*range(0xFE00, 0xFE10), *range(0xE0000, 0xE1000)}
-"""Letters and marks that show nothing: Unicode's Default_Ignorable_Code_Point that are in none of
-the categories below, and the blank pattern of Braille."""
+"""Invisible letters and marks: Unicode's Default_Ignorable_Code_Point outside the categories below,
+and the blank pattern of Braille."""
 REFUSED = {
     "Cc": "a control character",
     "Cf": "an invisible character, or one that reverses text",
-    "Cn": "a character that this service does not know",
+    "Cn": "an unassigned character",
     "Co": "a character of private use",
     "Cs": "half a character",
     "Zl": "a line separator",
     "Zp": "a paragraph separator",
 }
-"""Unicode categories that no name has."""
+"""Refused Unicode categories."""
 CONTROLS = {"\0": "NULL", "\b": "BACKSPACE", "\t": "TAB", "\n": "LINE FEED", "\r": "RETURN"}
 CONTROLS |= {"\x1b": "ESCAPE", "\x7f": "DELETE"}
-"""Control characters have no names in Unicode; these are those of keys and terminals."""
+"""Names of control characters, which have none in Unicode."""
 
 
 def _checked(text: str, allowed: str) -> str:
@@ -38,11 +38,11 @@ def _checked(text: str, allowed: str) -> str:
             shown = f"U+{ord(character):04X}" + (f" ({name})" if name else "")
             raise ValueError(f"has {shown}, {why}: leave it out")
     if not any(unicodedata.category(c)[0] in "LNPS" for c in text):
-        raise ValueError("shows nothing: write a name, or what is to be said")
+        raise ValueError("has no visible character: write a name or a sentence")
     return text
 
 
 ONE_LINE = AfterValidator(lambda text: _checked(text, ""))
-"""Of a person's name. Stands behind the limits of its length."""
+"""For a person's name; after the limits of its length."""
 LINES = AfterValidator(lambda text: _checked(text.replace("\r\n", "\n"), "\n"))
-"""Of what a person says, which may have several lines."""
+"""For a person's statement, which may have several lines."""

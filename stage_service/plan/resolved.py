@@ -1,4 +1,4 @@
-"""A plan on a rig: `resolve` makes it once, and everybody who shoots or costs it gets that one."""
+"""A plan applied to a rig: made once by `resolve`, used to cost and to shoot it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from stage_service.plan.steps import expand, exposures_of, no_controller, rows_o
 from stage_service.plan.timeline import timeline
 
 MOST_LISTED = 20
-"""So many wrong names are told one by one."""
+"""Wrong names that are listed one by one."""
 
 
 class PlanError(ValueError):
-    """A plan that this rig cannot shoot; `problems` has one sentence for each reason."""
+    """The rig cannot shoot this plan; `problems` has one sentence for each reason."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("; ".join(problems))
@@ -36,7 +36,7 @@ class PlanError(ValueError):
 class ResolvedPlan:
     """A plan that `rig_file` can shoot: its steps in order, divided into runs.
 
-    `stepping_why` says why they are clocked as they are.
+    `stepping_why` is the reason for how they are clocked.
     """
 
     plan: CapturePlan
@@ -48,33 +48,33 @@ class ResolvedPlan:
     @property
     def retries(self) -> int:
         """How often a missing frame is shot again."""
-        asked = self.plan.retries
-        return self.rig_file.capture.retries if asked is None else asked
+        retries = self.plan.retries
+        return self.rig_file.capture.retries if retries is None else retries
 
     def at_rate(self, hz: float) -> ResolvedPlan:
-        """The same steps, at most `hz` a second."""
+        """The same steps, at most `hz` per second."""
         return replace(self, plan=self.plan.model_copy(update={"rate_hz": hz}))
 
     def check_flashing(self, armed_by: str | None) -> None:
-        """Raise `FlashRefusal` where flashes lack consent, or somebody who answers for them."""
+        """Raise `FlashRefusal` where flashes lack consent or arming."""
         cost, consent = self.cost, self.plan.consent
         if cost.flash.needs_consent and not (consent and armed_by):
             slow = self.at_rate(SLOW_HZ).cost
             raise FlashRefusal(cost.flash, consent, seconds=cost.seconds, slow_seconds=slow.seconds)
 
     def check_room(self, folder: Path) -> None:
-        """Raise `PlanError` where its frames do not fit on the disk of `folder`, or it is gone."""
+        """Raise `PlanError` where the frames do not fit on the disk of `folder`, or it is gone."""
         try:
             needed, free = self.cost.bytes, shutil.disk_usage(folder).free
         except FileNotFoundError:
-            raise PlanError([f"{folder} is not there: is its disk?"]) from None
+            raise PlanError([f"{folder} does not exist: check its disk"]) from None
         if needed + RESERVE > free:
             need, kept, have = (f"{n / 1e9:.2f} GB" for n in (needed, RESERVE, free))
             raise PlanError([f"the plan writes {need} and leaves {kept} free, {folder} has {have}"])
 
     @cached_property
     def cost(self) -> PlanCost:
-        """What it takes, predicted."""
+        """The predicted cost."""
         rig, steps, rate_hz = self.rig_file.rig, self.steps, self.plan.rate_hz
         cameras, folder = len(rig.cameras), folder_bytes(rig)
         causes = seconds_by_cause(
@@ -107,7 +107,7 @@ class ResolvedPlan:
         )
 
     def _left_out(self) -> tuple[LeftOutWork, ...]:
-        """What "all" does not contain on this rig, and why."""
+        """What "all" omits on this rig, and why."""
         rig = self.rig_file.rig
         if self.plan.projectors != "all":
             return ()
@@ -123,7 +123,7 @@ class ResolvedPlan:
 
 
 def resolve(plan: CapturePlan, rig_file: RigFile) -> ResolvedPlan:
-    """The plan on this rig; touches no device. Raises `PlanError` with all that it cannot do."""
+    """Apply a plan to a rig; uses no device. Raises `PlanError` with every problem."""
     problems = _misfits(plan, rig_file)
     steps = () if problems else expand(plan, rig_file)
     if not problems and not steps:
@@ -141,7 +141,7 @@ def resolve(plan: CapturePlan, rig_file: RigFile) -> ResolvedPlan:
 
 
 def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
-    """What the plan asks for that the rig does not have."""
+    """What the plan requires and the rig does not have."""
     rig, devices = rig_file.rig, rig_file.devices
     problems = _unknown("light", plan.lights, [x.name for x in rig.lights])
     problems += _unknown("projector", plan.projectors, [x.name for x in rig.projectors])

@@ -1,4 +1,4 @@
-"""Who clocks the steps, the service or the trigger box, and how long that takes."""
+"""Which of service and trigger box clocks the steps, and how long they take."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from stage_service.config import DevicesConfig, RigFile
 Stepping = Literal["software", "hardware"]
 
 LATENCY_S = 0.002
-"""Time that the command, the confirmation and the pulse of a software-stepped step take."""
+"""Command, confirmation and pulse of a software-stepped step."""
 UPLOAD_S = 0.05
-"""Time that arming, uploading and starting a hardware-stepped run takes."""
+"""Arming, uploading and starting a hardware-stepped run."""
 SHORTEST_RUN = 8
 """Steps below which uploading a table takes longer than it saves."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Consecutive steps that are clocked alike; in hardware they share one exposure time."""
+    """Consecutive steps with one kind of stepping; in hardware they share one exposure time."""
 
     steps: tuple[Step, ...]
     stepping: Stepping
@@ -31,20 +31,20 @@ class Run:
 def runs(
     steps: tuple[Step, ...], rig_file: RigFile, requested: Literal["auto", "software", "hardware"]
 ) -> tuple[tuple[Run, ...], str]:
-    """Divide the steps of a plan into runs, and say why they are clocked as they are.
+    """Divide the steps of a plan into runs; returns them and the reason for their stepping.
 
-    A hardware-stepped run is never longer than what the cameras hold unread: the box cannot wait
-    for a slow link or disk, so the sequence waits between runs and no frame is dropped. Lamps of a
-    bank without a sequence table are lit by the service.
+    A hardware-stepped run has at most as many steps as the cameras can hold unread frames: the box
+    cannot wait for a slow link or disk. The service lights the lamps of a bank without a sequence
+    table.
     """
     devices = rig_file.devices
     why = ""
     if requested == "software":
-        why = "the plan asks for it"
+        why = "the plan requests it"
     elif devices is None or not devices.hardware_stepping:
-        why = "the rig file does not say that the trigger box's gates are wired (hardware_stepping)"
+        why = "hardware_stepping is not set in the rig file: the trigger box's gates are not wired"
     elif devices.cameras.buffers < SHORTEST_RUN:
-        why = f"the cameras hold only {devices.cameras.buffers} frames unread"
+        why = f"the cameras hold only {devices.cameras.buffers} unread frames"
     if why:
         return (Run(steps, "software"),), why
     assert devices is not None
@@ -71,7 +71,7 @@ def runs(
 
 
 def period_s(step: Step, devices: DevicesConfig, rate_hz: float | None) -> float:
-    """Seconds from one hardware-stepped step to the next: the sensor is read before the next."""
+    """Seconds from one hardware-stepped step to the next, sensor readout included."""
     light = devices.lights.settle_s + step.exposure
     return max(light + devices.cameras.readout_s, 1 / rate_hz if rate_hz else 0.0)
 
@@ -86,8 +86,8 @@ def seconds_by_cause(
 ) -> dict[str, float]:
     """Predicted seconds by cause; `wire_bytes` and `folder_bytes` are those of one step.
 
-    Software-stepped, a step's frames are read before the next step begins. Hardware-stepped, they
-    are read while the box goes on: only what link lags behind counts. Writing goes on beside all.
+    In software a step's frames are read before the next step begins; in hardware they are read
+    during the run, so only the link's lag counts. Frames are written in parallel.
     """
     devices = rig_file.devices
     causes = dict.fromkeys(
@@ -123,7 +123,7 @@ def seconds_by_cause(
 
 
 def limited_by(causes: dict[str, float]) -> str:
-    """What limits the rate most, in a few words."""
+    """The cause that takes most of the time, in a few words."""
     cause, seconds = max(causes.items(), key=lambda item: item[1])
     share = seconds / max(sum(causes.values()), 1e-12)
     return f"{cause}: {share:.0%} of the time"

@@ -1,4 +1,4 @@
-"""The steps of a plan on a rig, in the order in which they are shot."""
+"""The steps of a plan on a rig, in shooting order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stage_service.plan.capture_plan import CapturePlan, Rows
 
 
 def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
-    """The plan's steps; it names only what the rig has."""
+    """The steps of a plan that names only what the rig has."""
     defaults = rig_file.capture
     exposures, levels = exposures_of(plan, rig_file), levels_of(plan, rig_file)
     ends = [{"kind": "dark"}, {"kind": "all_on"}] if plan.sentinels else []
@@ -51,14 +51,14 @@ def levels_of(plan: CapturePlan, rig_file: RigFile) -> Levels:
 
 
 def swept(plan: CapturePlan, rig_file: RigFile) -> list[Projector]:
-    """The projectors that sweep; "all" are none where nothing controls them."""
+    """The projectors that sweep; "all" is none without a controller."""
     if plan.projectors == "all":
         return [] if no_controller(rig_file) else list(rig_file.rig.projectors)
     return [p for p in rig_file.rig.projectors if p.name in plan.projectors]
 
 
 def no_controller(rig_file: RigFile) -> bool:
-    """Whether the rig file has devices, but none for projectors."""
+    """Whether the rig file has devices, but no projector controller."""
     return rig_file.devices is not None and rig_file.devices.projectors is None
 
 

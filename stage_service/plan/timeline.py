@@ -1,4 +1,4 @@
-"""When a plan's lights go on and off, as predicted."""
+"""The predicted times at which a plan's lights go on and off."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Lit(NamedTuple):
 def timeline(
     parts: Sequence[Run], rig_file: RigFile, *, rate_hz: float | None, lag_s: float = 0.0
 ) -> Iterator[Lit]:
-    """The steps that light something, in order, retries apart.
+    """The steps that light something, in order, without retries.
 
-    `lag_s` is what each step waits for the disk. The trigger box waits for nobody: the link and the
-    disk catch up between its runs, and the next table is uploaded.
+    `lag_s` is each step's wait for the disk. In hardware the link and the disk catch up between
+    runs, while the next table is uploaded.
     """
     devices = rig_file.devices
     now = 0.0
