@@ -184,8 +184,8 @@ def run_worker(
     """Serve a queue of `root` until SIGTERM or SIGINT; calls `ready` with this worker's name.
 
     With `gpu` the queue of jobs that render, for a service with `gpu_workers`. `take_over` is a
-    dead machine of this root, whose workers' jobs are resumed. Ends the process; the next worker resumes
-    a step under way.
+    dead machine of this root, whose workers' jobs are resumed. Ends the process; the next worker
+    resumes a step under way.
     """
     worker = Worker(root, concurrency)
     names = worker.queue.names

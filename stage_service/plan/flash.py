@@ -88,8 +88,8 @@ class _Train:
 
 
 class Trains:
-    """All lights as one train, and the full-field flashes among them as another: tracking frames are
-    much brighter than scanlines and have a rate of their own."""
+    """All lights as one train, and the full-field flashes among them as another: tracking frames
+    are much brighter than scanlines and have a rate of their own."""
 
     def __init__(self) -> None:
         self.each = _Train()

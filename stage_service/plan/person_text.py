@@ -1,7 +1,7 @@
 """Checks of names and sentences that people type in.
 
-A name is shown to others as who steers, has looked, or armed flashes. Invisible characters, and those
-that reorder text, would let it look like another person's.
+A name is shown as who steers, has looked, or armed flashes. Invisible characters, and those that
+reorder text, would let it look like another person's.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ def test_a_port_that_only_echoes_is_told_from_another_device(serial_stage, slack
     config = SerialConfig(port=str(peer.link), timeout_s=TIMEOUT_S * slack)
     driver = make(config) if make is SerialTriggerBox else make(config, ("left",))
     with pytest.raises(
-        DeviceError, match=r"received 'ID\?'. The line sends back what it gets"
+        DeviceError, match=r"received 'ID\?'. The line echoes"
     ) as e:
         driver.connect()
     assert "\\d" not in str(e.value)
@@ -91,7 +91,7 @@ def test_a_port_that_only_echoes_is_told_from_another_device(serial_stage, slack
 
 IDENTITIES = [
     ("HAIRSTAGE-TRIGGER 2 8", "This is another device: check the ports in the rig file."),
-    ("HAIRSTAGE-PROJECTORS 2 8 left eye", "It is the right kind of device, with an identity that"),
+    ("HAIRSTAGE-PROJECTORS 2 8 left eye", "Its identity is not one of"),
     ("thermometer", "This is another device: check the ports in the rig file."),
 ]
 

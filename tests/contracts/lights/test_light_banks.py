@@ -195,7 +195,7 @@ def test_a_bank_that_cannot_guarantee_a_blackout_is_refused(bench, kind):
         one.driver.connect()
     text = str(refusal.value)
     assert "lit lamps stay lit" in text
-    assert "that the lamps are off is never known" in text
+    assert "cannot confirm that the lamps are off" in text
     assert "accept_unverified_blackout = true" in text
     assert one.seen == []
 

@@ -39,5 +39,5 @@ def test_a_text_may_have_lines_and_a_blank_one_shows_nothing():
     assert TEXT.validate_python("agreed\non paper") == "agreed\non paper"
     with pytest.raises(ValidationError, match="RIGHT-TO-LEFT OVERRIDE"):
         TEXT.validate_python("agreed\u202e")
-    with pytest.raises(ValidationError, match="shows nothing"):
+    with pytest.raises(ValidationError, match="no visible character"):
         NAME.validate_python(" \u00a0")
