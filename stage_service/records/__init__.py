@@ -1,1 +1,1 @@
-"""Who did what: audit, events, leases."""
+"""Audit log, events, leases, tokens and logins."""

@@ -1,4 +1,4 @@
-"""Wrong logins, and how long whoever made them has to wait for the next."""
+"""Limits the rate of wrong logins by address."""
 
 from __future__ import annotations
 
@@ -9,25 +9,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 FREE = 5
-"""Wrong tokens that cost no wait: whoever pastes the wrong line tries again at once."""
+"""Wrong tokens without a wait, as for a line pasted by mistake."""
 FIRST_S, LONGEST_S = 1.0, 30.0
-"""The wait after one more, doubled by each that follows, and its end: whoever shares an address
-with a program that guesses gets in soon after it has ended. A token has 256 random bits; the wait
-is there for tokens that people write themselves, and for the machine's sake."""
+"""The first wait, doubled by each further wrong token, and the longest. A generated token has 256
+random bits; the wait protects tokens that people choose, and the machine."""
 FORGET_S = 900.0
-"""After so long without a wrong one all is forgotten."""
+"""Seconds without a wrong token after which the count is reset."""
 MOST_KEPT = 1000
-"""Addresses; one more forgets the one that has waited longest."""
+"""Addresses that are counted; the oldest is dropped first."""
 
 
 class TooManyLogins(PermissionError):
-    """Too many wrong logins came from there; `retry_after` is the wait in seconds."""
+    """Too many wrong logins from one address; `retry_after` is the wait in seconds."""
 
     def __init__(self, origin: str, seconds: float) -> None:
         self.retry_after = max(1, round(seconds + 0.5))
         super().__init__(
             f"too many wrong logins from {origin}: log in again in {self.retry_after} s. This "
-            "login's token was not looked at"
+            "login's token was not checked"
         )
 
 
@@ -39,7 +38,7 @@ class _Wrong:
 
 
 class Attempts:
-    """Wrong logins by where they came from. None waits here: one that is too early is refused."""
+    """Counts wrong logins by address and refuses early ones."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -55,8 +54,8 @@ class Attempts:
             raise TooManyLogins(origin, left)
 
     def failed(self, origin: str) -> None:
-        """A wrong login came from `origin`. A right one changes nothing: who has a token could
-        else guess another between two of their own."""
+        """Count a wrong login. A right one does not reset the count, or the owner of a token could
+        guess others between two logins of their own."""
         now = self._clock()
         with self._lock:
             wrong = self._wrong.setdefault(origin, _Wrong())

@@ -1,4 +1,4 @@
-"""Who did what to the stage, and what came of it: one line of JSON each, never changed."""
+"""The audit log of actions on the stage: one line of JSON each, append-only."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from reconstruction.reading import printable
 
 log = logging.getLogger("hairstage.audit")
 SERVICE = "service"
-"""Who acts when nobody asked for it."""
+"""The actor of actions without a caller."""
 MOST_WAITING = 1000
-"""Lines that wait for a disk that does not answer, 0.5 MB; more go to the service's log alone."""
+"""Lines queued for a disk that hangs, 0.5 MB; more go to the service's log alone."""
 
 
 class NotRecorded(OSError):
-    """What has to be on the disk first could not be written; what it was for is refused."""
+    """A record that an action requires could not be written; the action is refused."""
 
     def __init__(self, what: str, path: Path, error: OSError) -> None:
         super().__init__(
-            f"{what} could not be written to {path}: {error.strerror or error}. It does not count: "
-            "make room on the disk, or see why it cannot be written to, then try again"
+            f"{what} could not be written to {path}: {error.strerror or error}. The action is "
+            "refused: free space on the disk, or repair it, then try again"
         )
 
 
 class Action(BaseModel):
     """`who` did `action` to `subject` (a capture's id, or the stage) at `time` (UTC).
 
-    `result` is "ok", "refused", or what an action that takes long came to; `detail` says why.
+    `result` is "ok", "refused", or the end of a long action; `detail` is the reason.
     """
 
     time: str
@@ -48,8 +48,7 @@ class Action(BaseModel):
 
 
 class AuditLog:
-    """`path`, append-only; each line is on the disk when `record` returns. Lines are written in the
-    order in which they were recorded."""
+    """The file `path`, append-only; lines are written in the order of the calls."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -62,7 +61,7 @@ class AuditLog:
     def record(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
     ) -> None:
-        """Append an action. A disk that is full is logged: it must not keep a lamp lit."""
+        """Append an action; on the disk on return. A full disk is only logged."""
         done, mine = self._enter(who, action, subject, result, detail)
         if mine:
             self._write()
@@ -71,24 +70,25 @@ class AuditLog:
     def later(
         self, who: str, action: str, subject: str, result: str = "ok", detail: str = ""
     ) -> Future[None]:
-        """As `record`, for callers that must not wait for a disk; done once the line is written."""
+        """As `record`, without waiting for the disk; the future is done once the line is
+        written."""
         done, mine = self._enter(who, action, subject, result, detail)
         if mine:
             try:
                 threading.Thread(target=self._write, name="audit", daemon=True).start()
-            except RuntimeError:  # no thread is to be had: the next one writes it, too
+            except RuntimeError:  # no thread available: the next call writes it
                 self._writing = False
         return done
 
     def flush(self, within_s: float) -> None:
-        """Wait, no longer than this, until what was recorded is on the disk."""
+        """Wait, at most `within_s` seconds, until all lines are on the disk."""
         if self._last is not None:
             wait([self._last], within_s)
 
     def _enter(
         self, who: str, action: str, subject: str, result: str, detail: str
     ) -> tuple[Future[None], bool]:
-        """When the line is written; whether the caller is the one to write what waits."""
+        """Queue a line; returns its future, and whether the caller has to write the queue."""
         line = _line(who, action, subject, result, detail)
         done: Future[None] = Future()
         with self._queue:
@@ -119,7 +119,7 @@ class AuditLog:
 
     def _append(self, line: str) -> None:
         with self._lock, self._path.open("ab+") as file:
-            # What a crash left of a line must not swallow this one.
+            # A line torn by a crash must not swallow this one.
             if file.tell():
                 file.seek(-1, os.SEEK_END)
                 line = line if file.read(1) == b"\n" else f"\n{line}"
@@ -128,7 +128,7 @@ class AuditLog:
             os.fsync(file.fileno())
 
     def require(self, who: str, action: str, subject: str, detail: str) -> None:
-        """Append what has to be on the record before it is done. Raises `NotRecorded`."""
+        """Append an action before it is carried out. Raises `NotRecorded`."""
         try:
             self._append(_line(who, action, subject, "ok", detail))
             flush(self._path.parent)  # the file may be new
@@ -136,7 +136,7 @@ class AuditLog:
             raise NotRecorded(f"the record of {action}", self._path, error) from error
 
     def latest(self, limit: int) -> list[Action]:
-        """The newest actions, oldest of them first; a torn line is left out."""
+        """The newest actions, oldest first; torn lines are skipped."""
         newest = []
         try:
             with self._lock, self._path.open(errors="replace") as file:

@@ -1,12 +1,12 @@
-"""Clocks that notice what the monotonic one hides: a machine that slept, a clock that was set."""
+"""Clocks that detect a machine that slept, and a wall clock that was set."""
 
 from __future__ import annotations
 
 import time
 
 JUMP_S = 2.0
-"""Seconds by which wall clock and monotonic clock may drift apart between two looks: a clock that
-is disciplined drifts by milliseconds, one that was set or slept through a suspend by more."""
+"""Largest drift in seconds between wall clock and monotonic clock from one check to the next. NTP
+causes milliseconds; setting the clock, or a suspend, causes more."""
 
 
 def wall_seconds() -> float:
@@ -15,18 +15,18 @@ def wall_seconds() -> float:
 
 
 def boot_seconds() -> float:
-    """Seconds since the machine started, those that it slept through included."""
+    """Seconds since the machine started, including suspends."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class ClockWatch:
-    """Compares the wall clock with the monotonic one, look by look."""
+    """Compares the wall clock with the monotonic clock."""
 
     def __init__(self) -> None:
         self._ahead = self._now()
 
     def jump(self) -> float | None:
-        """Seconds by which the wall clock jumped since the last look; None below `JUMP_S`."""
+        """Seconds by which the wall clock jumped since the last call; None below `JUMP_S`."""
         before, self._ahead = self._ahead, self._now()
         jumped = self._ahead - before
         return jumped if abs(jumped) > JUMP_S else None

@@ -1,4 +1,4 @@
-"""A numbered log of what happened, for listeners that come and go."""
+"""A numbered log of events, with replay."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reconstruction.capture.writer import utc_now
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: `number` counts from 1, `kind` is e.g. "capture.state"."""
+    """An event: `number` counts from 1, `kind` is e.g. "capture.state"."""
 
     number: int
     kind: str
@@ -23,7 +23,7 @@ class Event:
 
 
 class EventLog:
-    """Events in order, the last `capacity` of them kept for replay; safe for many threads."""
+    """Events in order, the last `capacity` stored for replay; safe for many threads."""
 
     def __init__(self, capacity: int = 10_000) -> None:
         self._events: deque[Event] = deque(maxlen=capacity)
@@ -32,7 +32,7 @@ class EventLog:
         self._listeners: list[Callable[[], object]] = []
 
     def subscribe(self, listener: Callable[[], object]) -> None:
-        """Have `listener` called after each event, by whoever published it: it must not wait."""
+        """Call `listener` after each event, on the publishing thread: it must not block."""
         self._listeners.append(listener)
 
     @property
@@ -42,7 +42,7 @@ class EventLog:
             return self._last
 
     def publish(self, kind: str, data: dict[str, Any]) -> Event:
-        """Append an event and wake everyone who waits."""
+        """Append an event and wake waiting threads."""
         with self._changed:
             self._last += 1
             event = Event(self._last, kind, utc_now(), data)
@@ -53,16 +53,16 @@ class EventLog:
         return event
 
     def wait(self, number: int, timeout: float) -> list[Event]:
-        """The kept events after `number`, oldest first; waits up to `timeout` seconds for one."""
+        """The stored events after `number`, oldest first; waits up to `timeout` seconds for one."""
         with self._changed:
             self._changed.wait_for(lambda: self._last > number, timeout)
             return self._after(number, len(self._events))
 
     def after(self, number: int, most: int) -> list[Event]:
-        """The first `most` kept events after `number`, oldest first; waits for none."""
+        """The first `most` stored events after `number`, oldest first; does not wait."""
         with self._changed:
             return self._after(number, most)
 
     def _after(self, number: int, most: int) -> list[Event]:
-        seen = max(0, number - (self._last - len(self._events)))  # of those that are kept
-        return list(islice(self._events, seen, seen + most))
+        skipped = max(0, number - (self._last - len(self._events)))
+        return list(islice(self._events, skipped, skipped + most))

@@ -1,4 +1,4 @@
-"""Who may steer: one lease at a time, and one service to a root folder."""
+"""One lease at a time to steer the stage, and one service to a root folder."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from stage_service.records.clock import boot_seconds, wall_seconds
 
 log = logging.getLogger("hairstage.lease")
 LONGEST_LEASE_S = 86400.0
-"""A day: whoever forgets a lease keeps others from the stage for no longer."""
+"""One day: a forgotten lease blocks the stage no longer."""
 NO_TOKEN = "-"
-"""Instead of a digest: no token is that of this lease."""
+"""A digest that no token has."""
 
 
 class Leased(RuntimeError):
-    """Somebody else holds the lease."""
+    """Another caller holds the lease."""
 
     def __init__(self, lease: Lease) -> None:
         super().__init__(
@@ -41,13 +41,12 @@ class Leased(RuntimeError):
 
 
 class NoLease(LookupError):
-    """The token is not that of the current lease: it has expired, or was released."""
+    """The token's lease has expired or was released."""
 
 
 @dataclass(frozen=True)
 class Lease:
-    """Held by `holder` until `expires` (UTC); whoever sends the token of this SHA-256 steers in
-    their name."""
+    """Held by `holder` until `expires` (UTC); `digest` is the SHA-256 of its token."""
 
     holder: str
     expires: str
@@ -56,13 +55,13 @@ class Lease:
 
 @dataclass(frozen=True)
 class GrantedLease(Lease):
-    """A lease with its token, which is kept nowhere."""
+    """A lease with its token, which is not stored."""
 
     token: str
 
 
 class _Kept(BaseModel):
-    """The file: `seconds` is what was granted, `ends` the wall clock at the end, Unix seconds."""
+    """The file: the granted `seconds`, and the end `ends` by the wall clock, Unix seconds."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -73,13 +72,12 @@ class _Kept(BaseModel):
 
 
 class Leases:
-    """At most one lease, kept in the file `path`; while there is one, only its token steers.
+    """At most one lease, stored in the file `path`; while there is one, only its token steers.
 
-    It is on the disk before `take` and `renew` return, which raise `NotRecorded` where it cannot
-    be, and so it is there after a restart: until `expires` by the wall clock, and never for longer
-    than it was granted for. A file that cannot be read may be anybody's lease: nobody steers for
-    the longest time that a lease has, unless an admin ends it. `clock` and `wall` give seconds; no
-    other method than those that change the lease waits for the disk.
+    `take` and `renew` store it before they return, or raise `NotRecorded`, so it survives a
+    restart: until `expires` by the wall clock, and never longer than it was granted. An unreadable
+    file may be anyone's lease: it blocks steering for `LONGEST_LEASE_S`, unless an admin ends it.
+    `clock` and `wall` return seconds. Only methods that change the lease wait for the disk.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ class Leases:
             return GrantedLease(lease.holder, lease.expires, lease.digest, token)
 
     def renew(self, token: str, seconds: float) -> Lease:
-        """Let the lease end so many seconds from now. Raises `NoLease`, `NotRecorded`."""
+        """Extend the lease to `seconds` from now. Raises `NoLease`, `NotRecorded`."""
         with self._writing:
             lease = self._own(token)
             return self._keep(lease.holder, seconds, lease.digest)
@@ -123,25 +121,25 @@ class Leases:
             self._forget()
 
     def end(self) -> Lease:
-        """End the lease whoever holds it. Raises `NoLease` where nobody does."""
+        """End any lease. Raises `NoLease` if there is none."""
         with self._writing:
             if (lease := self.current) is None:
-                raise NoLease("nobody holds a lease")
+                raise NoLease("there is no lease")
             self._forget()
             return lease
 
     def of_others(self, token: str | None) -> Lease | None:
-        """The lease that keeps whoever sends this token from steering; None where none does."""
+        """Another caller's lease, which blocks this token; None if there is none."""
         held = self.current
         return None if held is None or _same(token, held) else held
 
     def check(self, token: str | None) -> None:
-        """Raise `Leased` unless nobody holds a lease, or this token is its own."""
+        """Raise `Leased` if another caller holds the lease."""
         if (held := self.of_others(token)) is not None:
             raise Leased(held)
 
     def holder(self, token: str | None) -> str | None:
-        """Who holds the lease of this token."""
+        """The holder of this token's lease."""
         held = self.current
         return held.holder if held is not None and _same(token, held) else None
 
@@ -157,8 +155,9 @@ class Leases:
         return held
 
     def _keep(self, holder: str, seconds: float, digest: str) -> Lease:
-        """Write the lease, then let it count. Raises `NotRecorded`; then the one before counts."""
-        ends, wall = self._clock() + seconds, self._wall() + seconds  # not longer by a slow disk
+        """Store the lease, then make it the current one. Raises `NotRecorded`; the old one
+        stays."""
+        ends, wall = self._clock() + seconds, self._wall() + seconds  # before the disk's delay
         kept = _Kept(holder=holder, digest=digest, seconds=seconds, ends=wall)
         self._write(kept)
         with self._lock:
@@ -178,24 +177,24 @@ class Leases:
         try:
             self._path.unlink(missing_ok=True)
             flush(self._path.parent)
-        except OSError:  # nobody is kept from steering for it but after a restart
-            log.exception("%s stays: its lease counts again after a restart", self._path)
+        except OSError:
+            log.exception("%s cannot be removed: its lease returns after a restart", self._path)
 
     def _read(self) -> None:
-        """Take up the lease of the service before."""
+        """Restore the lease of an earlier service."""
         try:
             kept = _Kept.model_validate(read_json(self._path))
         except FileNotFoundError:
             return
         except (OSError, ValueError):
-            log.exception("%s: nobody can tell who steers", self._path)
+            log.exception("%s: the lease cannot be read", self._path)
             holder = f"somebody unknown ({self._path.name} is damaged; an admin can end the lease)"
             ends = self._wall() + LONGEST_LEASE_S
             kept = _Kept(holder=holder, digest=NO_TOKEN, seconds=LONGEST_LEASE_S, ends=ends)
             try:
-                self._write(kept)  # or it would begin anew with each start
+                self._write(kept)  # else it would start again with every restart
             except NotRecorded:
-                log.exception("%s stays as it is", self._path)
+                log.exception("%s is left as it is", self._path)
         left = min(kept.ends - self._wall(), kept.seconds)
         if left > 0:
             self._lease = Lease(kept.holder, _utc(self._wall() + left), kept.digest)
@@ -215,14 +214,15 @@ def _utc(seconds: float) -> str:
 
 
 class LockedBy(OSError):
-    """Somebody else holds the lock; the message is what they left in it."""
+    """Another process holds the lock; the message is the lock file's text."""
 
 
 class FileLock:
-    """Held until `release`; the kernel frees it when the process dies. `text` says who holds it.
+    """A lock held until `release`; the kernel frees it when the process dies. `text` names the
+    holder.
 
-    A lock that is `shared` may be taken by every user of the machine. `left_by` is the text of a
-    process that ended without `release`. Raises `LockedBy`.
+    A `shared` lock may be taken by every user of the machine. `left_by` is the text of a process
+    that ended without `release`. Raises `LockedBy`.
     """
 
     def __init__(self, path: Path, text: str, shared: bool = False) -> None:
@@ -237,17 +237,17 @@ class FileLock:
                     raise LockedBy(self._file.read(1000).strip() or "unknown") from None
             if self._is_there():
                 break
-            self._file.close()  # it was released, and removed, in between
+            self._file.close()  # released and removed in between
         self.left_by = self._file.read(1000).strip() or None
-        # A full disk must not keep a service from starting, which darkens: it only goes unnamed.
+        # A full disk must not keep a service from starting, which darkens the stage.
         with suppress(OSError):
             os.ftruncate(self._file.fileno(), 0)
             os.pwrite(self._file.fileno(), f"{text}\n".encode(), 0)
 
     def release(self) -> None:
-        """Give it up before the process ends."""
+        """Release the lock."""
         if not self._file.closed:
-            with suppress(OSError):  # another user's file in a folder for all
+            with suppress(OSError):  # another user's file in a shared folder
                 self._path.unlink()
             self._file.close()
 
@@ -259,8 +259,8 @@ class FileLock:
 
 
 def _opened(path: Path, shared: bool) -> IO[str]:
-    """The file at `path`, made where there is none. In a folder for all, as /tmp, the kernel lets
-    nobody open another user's file who would have made it."""
+    """Open or create the file at `path`. In a shared folder, as /tmp, the kernel refuses to open
+    another user's file with O_CREAT."""
     try:
         try:
             handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -269,16 +269,16 @@ def _opened(path: Path, shared: bool) -> IO[str]:
             if shared:
                 os.fchmod(handle, 0o666)
     except PermissionError as error:
-        raise LockedBy(f"another user, to whom {path} belongs") from error
+        raise LockedBy(f"another user, the owner of {path}") from error
     return os.fdopen(handle, "r+", errors="replace")
 
 
 class RootInUse(OSError):
-    """Another service drives the stage of this root folder."""
+    """Another service uses this root folder."""
 
 
 class RootLock(FileLock):
-    """Held for as long as a service uses `root`."""
+    """The lock of a service on its `root`."""
 
     def __init__(self, root: Path) -> None:
         try:

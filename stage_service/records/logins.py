@@ -1,4 +1,4 @@
-"""Who has logged in, and who may black out without: signed, so that nothing is stored of either."""
+"""Logins and blackout rights: signed texts, of which the service stores none."""
 
 from __future__ import annotations
 
@@ -20,25 +20,23 @@ from stage_service.records.tokens import hashed, write_secret
 
 log = logging.getLogger("hairstage.logins")
 LASTS_S = 12 * 3600.0
-"""A login is good for a day's work at the stage."""
+"""Seconds that a login is valid: a working day."""
 AHEAD_S = 300.0
-"""A clock that was set back by no more than this leaves the logins that it makes younger than now;
-by more it ends them."""
+"""Logins from the future are valid up to this many seconds, for a clock that was set back."""
 LOGOUTS_FILE = "logouts.json"
 MOST_LOGOUTS = 50
-"""Logouts that are kept of one token one by one; one more ends all logins of that token so far, so
-that the file stays small whoever logs in and out."""
+"""Logouts stored per token; one more ends all its logins so far, which bounds the file."""
 BLACKOUT = "blackout"
-"""What the right to a blackout is signed for."""
+"""The purpose of a signed blackout right."""
 
 
 class NotStored(OSError):
-    """The disk did not take what has to outlast a restart."""
+    """A logout could not be stored."""
 
 
 class Login(BaseModel):
-    """What a cookie says, signed: whose token (its hash), begun when, good until when (ns since
-    1970, UTC); `epoch` and `turn` are those of `Ended` at its begin."""
+    """The signed content of a cookie: the token's hash, begin and end (ns since 1970, UTC), and
+    `epoch` and `turn` of `Ended` at its begin."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,11 +49,10 @@ class Login(BaseModel):
 
 
 class Ended(BaseModel):
-    """The logins that are over before they expire; no clock decides it, as clocks are set.
+    """The logins that ended before they expire, independent of clocks.
 
-    `epoch` is that of all logins that are not over. Of each token's hash: its logins that have
-    ended, with when they would have expired (ns since 1970, UTC); and the last `turn` whose logins
-    are over altogether.
+    Only logins of the present `epoch` are valid. By a token's hash: `logins` that have ended, with
+    their expiry (ns since 1970, UTC), and the last of `turns` of which all logins have ended.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -66,7 +63,7 @@ class Ended(BaseModel):
     turns: dict[str, int]
 
     def has(self, login: Login) -> bool:
-        """Whether that login is over."""
+        """Whether the login has ended."""
         if login.epoch != self.epoch or login.turn <= self.turns.get(login.token, -1):
             return True
         return login.id in self.logins.get(login.token, {})
@@ -84,12 +81,12 @@ class Ended(BaseModel):
 
 
 class Logins:
-    """Logins and blackout rights of the service of `root`; without one they end with the process.
+    """Logins and blackout rights of the service of `root`; without a root they end with the
+    process.
 
-    A login is a signed text: whose token (its hash), from when, until when, and for which host and
-    port. Checking it takes no store, so no number of logins ends another. What it opens is what the
-    token opens now. `end` is on the disk before it returns; while the file of logouts is missing or
-    damaged at a start, all logins that were begun before are over.
+    A login is signed for one token, host and port, and has the token's present scopes. Checking
+    needs no store, so logins cannot evict each other. `end` stores a logout before it returns. If
+    the file of logouts is missing or damaged at a start, all earlier logins have ended.
     """
 
     def __init__(self, root: Path | None = None) -> None:
@@ -101,8 +98,7 @@ class Logins:
         self._read()
 
     def begin(self, token: str, place: str) -> str:
-        """Log in by a token, which was found good, at `place` (host and port); returns what the
-        cookie is to hold."""
+        """Log in by a valid token at `place` (host and port); returns the cookie's value."""
         now = time.time_ns()
         login = Login(
             token=hashed(token),
@@ -114,12 +110,12 @@ class Logins:
         return self._key.sign(_at(place), login.model_dump())
 
     def tokens_of(self, held: Iterable[str], place: str) -> list[str]:
-        """The hashes of the tokens that the good ones of these cookies stand for."""
+        """The hashes of the tokens of the valid ones among these cookies."""
         return [login.token for login in self._good(held, place)]
 
     def end(self, held: Iterable[str], place: str) -> None:
-        """Log out: these cookies open nothing any more. Raises `NotStored` where a copy of them
-        would open something again after a restart."""
+        """End the logins of these cookies. Raises `NotStored` if copies of them would be valid
+        again after a restart."""
         with self._lock:
             for login in self._good(held, place):
                 self._ended.add(login, time.time_ns())
@@ -128,15 +124,15 @@ class Logins:
                 self._store()
 
     def blackout_right(self, name: str) -> str:
-        """What a page keeps to darken the stage in this name, and for nothing else.
+        """A text that allows a page to darken the stage in this name, and nothing else.
 
-        It ends with the key, not with the login, the token or the time: darkness harms nobody, and
-        whoever was once let in may find that somebody must be put in the dark at once.
+        It ends with the key, not with login, token or time: a person who was once logged in must
+        always be able to put the lamps off.
         """
         return self._key.sign(BLACKOUT, {"name": name})
 
     def blackout_by(self, right: str) -> str | None:
-        """In whose name this right darkens the stage."""
+        """The name in a valid blackout right; None for another text."""
         data = self._key.verify(BLACKOUT, right)
         return None if data is None else str(data["name"])
 
@@ -144,7 +140,7 @@ class Logins:
         now, good = time.time_ns(), []
         for text in held:
             data = self._key.verify(_at(place), text)
-            with suppress(ValidationError):  # of another version of hairstage
+            with suppress(ValidationError):  # of another version
                 login = Login.model_validate(data)
                 in_time = login.begun - AHEAD_S * 1e9 <= now < login.until
                 if in_time and not self._ended.has(login):
@@ -158,7 +154,7 @@ class Logins:
             self._ended, self._stored = Ended.model_validate(read_json(self._file)), True
         except (OSError, ValueError) as error:
             if not isinstance(error, FileNotFoundError):
-                log.warning("%s: the logins until now are over: %s", self._file, error)
+                log.warning("%s: all earlier logins have ended: %s", self._file, error)
             with suppress(NotStored):
                 self._store()
 
@@ -171,14 +167,14 @@ class Logins:
             self._stored = True
         except OSError as error:
             log.warning("%s: not written: %s", self._file, error)
-            try:  # without the file all of them are over at the next start; a full disk allows that
+            try:  # without the file all logins end at the next start
                 self._file.unlink(missing_ok=True)
                 flush(self._file.parent)
             except OSError:
                 raise NotStored(
-                    f"{self._file}: {error}. The login is over; a copy of its cookie would open "
-                    "what its token opens once the service has been started again, for 12 hours "
-                    "from the login: revoke the token, or mend the disk and log out again"
+                    f"{self._file}: {error}. The login has ended; a copy of its cookie is valid "
+                    "again after a restart of the service, until 12 hours after the login: revoke "
+                    "the token, or repair the disk and log out again"
                 ) from error
 
 

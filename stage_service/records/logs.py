@@ -1,4 +1,4 @@
-"""Log records: as lines of JSON, with what they are about; and no more than a cause is worth."""
+"""Log records as lines of JSON with their subject, and a limited rate per cause."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ABOUT: ContextVar[dict[str, str]] = ContextVar("about", default={})  # noqa: B0
 
 @contextmanager
 def about(**ids: str) -> Iterator[None]:
-    """What this thread logs meanwhile is about these, for instance `capture="…"`."""
+    """Add these ids to the records of this thread, for instance `capture="…"`."""
     token = _ABOUT.set({**_ABOUT.get(), **ids})
     try:
         yield
@@ -31,7 +31,7 @@ class JsonLines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The record as JSON."""
         at = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        told = {
+        data = {
             "time": at,
             "level": record.levelname,
             "logger": record.name,
@@ -40,20 +40,20 @@ class JsonLines(logging.Formatter):
             **_ABOUT.get(),
         }
         if record.exc_info:
-            told["error"] = self.formatException(record.exc_info)
-        return json.dumps(told)
+            data["error"] = self.formatException(record.exc_info)
+        return json.dumps(data)
 
 
 EVERY_S = 60.0
-"""A cause that lasts has a line in the log so often, with how many times it has come meanwhile."""
+"""Interval of log lines of a lasting cause, each with its count."""
 MOST_CAUSES = 1000
-"""The oldest are forgotten beyond that."""
+"""Causes that are counted; the oldest is dropped first."""
 
 
 @dataclass
 class _Cause:
-    """Since when it lasts (None: it is over), how often it has come in all and since the newest
-    line, when that was logged, and whether a line of its present run is in the log."""
+    """Since when it lasts (None: over), its count in all and since the last line, the time of that
+    line, and whether its present period has a line."""
 
     since: float | None = None
     count: int = 0
@@ -63,8 +63,8 @@ class _Cause:
 
 
 class Causes:
-    """Trouble that comes again and again, by cause: a line when it begins, one a minute with a
-    count while it lasts, and one when it is over. Safe to call from several threads."""
+    """Repeated errors by cause: a line when one begins, one per minute with a count while it lasts,
+    and one when it ends. Safe to call from several threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -78,7 +78,7 @@ class Causes:
         detail: object,
         error: BaseException | None = None,
     ) -> None:
-        """It has come, once more; `error` is the traceback to log with a line."""
+        """Count an occurrence; `error` is the traceback for its line."""
         with self._lock:
             one = self._causes.pop(cause, None) or _Cause()
             self._causes[cause] = one  # the newest last
@@ -96,7 +96,7 @@ class Causes:
         log.error("%s: %s%s", cause, detail, again, exc_info=error)
 
     def over(self, log: logging.Logger, cause: str) -> None:
-        """It is over, or never was."""
+        """End a cause, if it lasts."""
         if cause not in self._causes:
             return
         with self._lock:
@@ -110,20 +110,19 @@ class Causes:
 
 
 CAUSES = Causes()
-"""Those of this process."""
+"""The causes of this process."""
 
 
 class Folded(logging.Filter):
-    """Counts records of libraries that log every failure of one `cause` as that cause; on a handler
-    it keeps them from the log. `loggers` are the libraries', `words` what such a record has in its
-    text or its traceback."""
+    """A handler's filter that counts libraries' records of one `cause` instead of logging them.
+    `loggers` are the libraries' loggers, `words` occur in the text or traceback of such records."""
 
     def __init__(self, log: logging.Logger, cause: str, loggers: set[str], words: set[str]) -> None:
         super().__init__()
         self._log, self._cause, self._loggers, self._words = log, cause, loggers, words
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """False for what is counted."""
+        """False for a counted record."""
         if record.name.partition(".")[0] not in self._loggers:
             return True
         text = record.getMessage()

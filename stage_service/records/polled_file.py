@@ -1,4 +1,4 @@
-"""A small file that another process may change, for readers that must not wait for its disk."""
+"""A small file that another process may change, read without waiting for its disk."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from stage_service.background import beside
 
 T = TypeVar("T")
 Version = tuple[int, int, int] | None
-"""Inode, time of the last change (ns) and size of a file; None: there is none."""
+"""Inode, modification time (ns) and size of a file; None: no file."""
 
 
 class PolledFile(Generic[T]):
-    """What `read()` returns, called again on a thread of its own once `path` has changed.
+    """The value of `read()`, called on a thread of its own whenever `path` has changed.
 
-    `value` waits at most `wait_s` seconds for the disk, and returns the last value meanwhile. It
-    looks at the disk once in `every_s` seconds.
+    `value` waits at most `wait_s` seconds for the disk, else returns the last value. The file is
+    checked at most once in `every_s` seconds.
     """
 
     def __init__(
@@ -28,29 +28,29 @@ class PolledFile(Generic[T]):
     ) -> None:
         self._path, self._read, self._wait_s, self._every_s = path, read, wait_s, every_s
         self._last: tuple[Version, T] = (None, first)
-        self._looking = threading.Lock()
-        self._look: Future[T] | None = None
+        self._polling = threading.Lock()
+        self._pending: Future[T] | None = None
         self._until = self._due = 0.0
 
     @property
     def value(self) -> T:
-        """The newest value; raises nothing that has to do with the disk."""
-        with self._looking:
+        """The newest value; raises no error of the disk."""
+        with self._polling:
             now = time.monotonic()
-            if (self._look is None or self._look.done()) and now >= self._due:
-                self._look = beside(self._looked, self._path.name)
+            if (self._pending is None or self._pending.done()) and now >= self._due:
+                self._pending = beside(self._poll, self._path.name)
                 self._until, self._due = now + self._wait_s, now + self._every_s
-            look, left = self._look, max(0.0, self._until - now)
-        if look is None:
+            pending, left = self._pending, max(0.0, self._until - now)
+        if pending is None:
             return self._last[1]
-        return look.result() if wait([look], left).done else self._last[1]
+        return pending.result() if wait([pending], left).done else self._last[1]
 
     def changed(self) -> None:
-        """Have the next reader wait for the file: this process has just written it."""
-        with self._looking:
-            self._look, self._due = None, 0.0
+        """Make the next reader wait for the file, which this process has just written."""
+        with self._polling:
+            self._pending, self._due = None, 0.0
 
-    def _looked(self) -> T:
+    def _poll(self) -> T:
         version = version_of(self._path)
         if version != self._last[0]:
             self._last = (version, self._read())
@@ -58,7 +58,7 @@ class PolledFile(Generic[T]):
 
 
 def version_of(path: Path) -> Version:
-    """What changes whenever the file does."""
+    """The file's version."""
     try:
         found = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Refused requests in the audit log: each cause at first line by line, then as a count."""
+"""Refused requests in the audit log: the first of each cause line by line, then as a count."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from stage_service.background import Background
 from stage_service.records.audit import AuditLog
 
 FIRST = 5
-"""Refusals of one cause that have a line each."""
+"""Refusals of one cause with a line each."""
 EVERY_S = 60.0
-"""Those after them have one line together, so often at most."""
+"""Interval of the line that counts further ones."""
 FORGET_S = 600.0
-"""A cause that has not come up for so long begins anew."""
+"""Seconds without a refusal after which a cause starts again."""
 MOST_CAUSES = 64
-"""Addresses and callers that are counted one by one; all others are one, for each route and kind of
-problem: 64 lines a minute are 20 MB a day."""
+"""Causes that are counted one by one; further addresses are counted together. 64 lines per minute
+are 20 MB per day."""
 LONGEST = 200
-"""Characters of a request's path that a line repeats."""
+"""Characters of a request's path in a line."""
 
 
 @dataclass
@@ -31,7 +31,7 @@ class _Count:
 
 
 class Refusals(Background):
-    """What `audit` records of refused requests. `note` waits for no disk."""
+    """Records refused requests in `audit`; `note` does not wait for the disk."""
 
     def __init__(self, audit: AuditLog) -> None:
         super().__init__("refusals")
@@ -62,7 +62,7 @@ class Refusals(Background):
         self._line(name, address, action, subject[:LONGEST], f"{slug}: {detail}")
 
     def close(self) -> None:
-        """Record what was only counted until now."""
+        """Record the remaining counts."""
         super().close()
         with self._changed:
             self._sum_up(math.inf)

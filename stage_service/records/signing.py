@@ -1,4 +1,4 @@
-"""Signed texts: what this root folder has handed out, and nobody else can have made."""
+"""Signed texts of a root folder."""
 
 from __future__ import annotations
 
@@ -21,22 +21,20 @@ from stage_service.records.tokens import write_secret
 log = logging.getLogger("hairstage.logins")
 KEY_FILE = "login.key"
 KEY_BYTES = 32
-"""As long as the hash (SHA-256): a longer key adds nothing."""
+"""The size of SHA-256; a longer key adds nothing."""
 LOOK_S = 1.0
-"""How often the file is looked at: a thread for each request would cost more than the check."""
+"""Interval at which the file is checked."""
 LONGEST_TEXT = 4096
-"""Characters of a signed text; a longer one is none of ours."""
+"""Longest signed text, in characters."""
 
 
 class SigningKey:
-    """A secret in `path` (mode 0600), with which texts are signed (HMAC-SHA256).
+    """A secret in `path` (mode 0600) that signs texts (HMAC-SHA256).
 
-    A key that is missing, damaged, or was readable by other users is replaced at the start: what
-    was signed before is void, and nothing opens by it. A key that another process replaces counts
-    from the next look on (`LOOK_S`); one that disappears, or that a hanging disk holds back, stays
-    as it was.
-    A disk that takes no key leaves one that lasts as long as the process; it is stored as soon as
-    the disk takes it. So it is without `path`.
+    A key that is missing, damaged, or readable by other users is replaced at the start, which voids
+    earlier texts. A key replaced by another process is used within `LOOK_S`; one that disappears,
+    or is on a disk that hangs, stays in use. Without `path`, or until the disk accepts it, the key
+    lasts as long as the process.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -58,7 +56,7 @@ class SigningKey:
         self._file = PolledFile(path, self._newest, self._key, wait_s=0.0, every_s=LOOK_S)
 
     def sign(self, purpose: str, data: dict[str, Any]) -> str:
-        """`data` as a text of URL-safe characters, which `verify` takes for this purpose alone."""
+        """`data` as a URL-safe text, valid for this purpose alone."""
         with self._lock:
             if not self._stored and (self._storing is None or self._storing.done()):
                 self._storing = beside(self._store, KEY_FILE)
@@ -66,7 +64,7 @@ class SigningKey:
         return f"{payload}.{_encoded(self._mac(purpose, payload))}"
 
     def verify(self, purpose: str, text: str) -> dict[str, Any] | None:
-        """What was signed for this purpose; None for anything else."""
+        """The data that was signed for this purpose; None for any other text."""
         payload, _, mac = text.partition(".")
         if len(text) > LONGEST_TEXT or not text.isascii():
             return None
@@ -77,16 +75,16 @@ class SigningKey:
 
     def _mac(self, purpose: str, payload: str) -> bytes:
         key = self._key if self._file is None else self._file.value
-        # A purpose has no line break, nor has a payload: no two pairs make the same text.
+        # Neither has a line break, so no two pairs make the same text.
         return hmac.digest(key, f"{purpose}\n{payload}".encode(), hashlib.sha256)
 
     def _newest(self) -> bytes:
-        """Of the file, where it holds one."""
+        """Read the file's key; the present one if it has none."""
         assert self._path is not None
         try:
             self._key, self._stored = _read(self._path), True
         except (OSError, ValueError) as error:
-            log.warning("%s: the key stays as it was: %s", self._path, error)
+            log.warning("%s: the present key stays in use: %s", self._path, error)
         return self._key
 
     def _store(self) -> None:
@@ -100,8 +98,7 @@ class SigningKey:
 
 
 def write_key(path: Path, key: bytes | None = None) -> None:
-    """Replace the key at `path`: everything that was signed with the old one is void. Raises
-    `OSError`."""
+    """Replace the key at `path`, which voids texts signed with the old one. Raises `OSError`."""
     write_secret(path, (secrets.token_bytes(KEY_BYTES) if key is None else key).hex() + "\n")
 
 
@@ -111,7 +108,7 @@ def _read(path: Path) -> bytes:
     mode = file.stat().st_mode & 0o777
     if mode & 0o077:
         file.chmod(0o600)
-        if not file.stat().st_mode & 0o077:  # else of a disk that has no modes
+        if not file.stat().st_mode & 0o077:  # else the disk has no modes
             raise ValueError(f"other users could read it (mode {mode:o})")
     key = bytes.fromhex(file.read_text("ascii").strip())
     if len(key) != KEY_BYTES:

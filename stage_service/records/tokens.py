@@ -1,4 +1,4 @@
-"""Who may do what: tokens, of which a file holds the hashes."""
+"""Tokens and their scopes; a file has their hashes."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from stage_service.records.polled_file import PolledFile
 
 Scope = Literal["read", "steer", "arm", "jobs", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
-"""See what there is; shoot; answer for flashes and for dark lamps; process; end others' leases."""
+"""Read; shoot; arm flashes and acknowledge dark lamps; run jobs; end others' leases."""
 
 
 WAIT_S = 0.5
-"""How long everybody waits for a disk that does not say whose a token is."""
+"""Seconds that a request waits for the file's disk."""
 
 
 class TokenError(ValueError):
-    """A token that cannot be made or revoked, or a file of tokens that cannot be read."""
+    """A token cannot be made or revoked, or the file of tokens cannot be read."""
 
 
 class UnknownToken(PermissionError):
-    """There is no such token, or not any more."""
+    """There is no such token."""
 
 
 class Identity(BaseModel):
-    """Whose token it is, and what it opens."""
+    """A token's name and scopes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,18 +50,17 @@ class Identity(BaseModel):
 
 
 class Entry(Identity):
-    """A line of the file: `sha256` is the token's, in hexadecimal. It was made at `made` (UTC)."""
+    """An entry of the file: the token's `sha256`, hexadecimal, made at `made` (UTC)."""
 
     sha256: str
     made: str
 
 
 class Tokens:
-    """The tokens in `path`; what another process changes there counts at once.
+    """The tokens in `path`; changes by other processes apply at once.
 
-    `own` is one more, with every scope, that stands in no file of the service: that of the user who
-    runs it. A file that is there and cannot be read opens nothing. While its disk does not answer
-    it is as it was last seen: whoever asks for darkness waits for no disk.
+    `own` is one more, with every scope: that of the user who runs the service. An unreadable file
+    grants nothing. While its disk hangs, the last content applies: a blackout waits for no disk.
     """
 
     def __init__(self, path: Path, own: str | None = None) -> None:
@@ -71,12 +70,11 @@ class Tokens:
         self._file = PolledFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
 
     def find(self, token: str) -> Identity | None:
-        """Whose token this is."""
+        """The identity of a token."""
         return self.behind(hashed(token))
 
     def behind(self, hash: str) -> Identity | None:
-        """Whose token has this hash. It is compared with each, in the same time whether one is
-        found or not."""
+        """The identity of the token with this hash, compared in constant time."""
         known = dict(self._file.value)
         if self._own is not None:
             known[self._own] = Identity(name=_user(), scopes=SCOPES)
@@ -87,7 +85,7 @@ class Tokens:
         return found
 
     def entries(self) -> list[Entry]:
-        """All of the file, the oldest first. Raises `TokenError`."""
+        """The file's entries, the oldest first. Raises `TokenError`."""
         try:
             lines = read_json(self._path) if self._path.exists() else []
             return [Entry.model_validate(line) for line in lines]
@@ -95,10 +93,7 @@ class Tokens:
             raise TokenError(f"{self._path}: {error}") from error
 
     def make(self, name: str, scopes: tuple[Scope, ...]) -> str:
-        """A new token, which is told only now. Raises `TokenError` where there is one of the name.
-
-        Of 256 random bits a plain hash tells nothing.
-        """
+        """Make a token; only its hash is stored. Raises `TokenError` if the name is taken."""
         with self._changing():
             entries = self.entries()
             if not is_file_name(name) or name in [e.name for e in entries]:
@@ -109,7 +104,7 @@ class Tokens:
             return token
 
     def revoke(self, name: str) -> None:
-        """End a token. Raises `TokenError` where there is none of that name."""
+        """Revoke a token. Raises `TokenError` if there is none of that name."""
         with self._changing():
             entries = self.entries()
             kept = [e for e in entries if e.name != name]
@@ -119,14 +114,14 @@ class Tokens:
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """For one thread of one process at a time; another's change in between would be lost."""
+        """A context for one thread of one process at a time."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._lock, self._path.with_suffix(".lock").open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
     def _opened(self) -> dict[str, Identity]:
-        """By hash; nothing where the file is missing or cannot be read."""
+        """Identities by hash; empty if the file is missing or unreadable."""
         with suppress(TokenError):
             return {e.sha256: Identity(name=e.name, scopes=e.scopes) for e in self.entries()}
         return {}
@@ -137,7 +132,7 @@ class Tokens:
 
 
 def own_file() -> Path:
-    """Where this user's own token lies, which the commands send to a service on this machine.
+    """The file of this user's own token, which commands send to a service on this machine.
 
     Raises `OSError` for a user without a home.
     """
@@ -151,20 +146,19 @@ def own_file() -> Path:
 
 
 def own_token() -> str:
-    """This user's own token; made where there is none. Raises `OSError`, also for an empty file: no
-    token at all would open everything."""
+    """This user's own token; made if there is none. Raises `OSError`, also for an empty file."""
     file = own_file()
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_secret(file, secrets.token_urlsafe(32) + "\n")
     token = plain_file(file, most=1000).read_text().strip()
     if not token:
-        raise OSError(f"{file} is empty: remove it to have another token")
+        raise OSError(f"{file} is empty: remove it to get a new token")
     return token
 
 
 def write_secret(path: Path, text: str) -> None:
-    """Write a small file that its user alone may read; it and its name are on the disk then."""
+    """Write a small file that only its user may read; on the disk on return."""
     with writing(path) as temporary:
         temporary.touch(0o600)
         temporary.write_text(text)
@@ -179,5 +173,5 @@ def _user() -> str:
 
 
 def hashed(token: str) -> str:
-    """What is kept of a token."""
+    """The stored hash of a token."""
     return hashlib.sha256(token.encode()).hexdigest()

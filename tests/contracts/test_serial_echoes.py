@@ -81,9 +81,7 @@ def test_a_port_that_only_echoes_is_told_from_another_device(serial_stage, slack
     stage.trigger.close()
     config = SerialConfig(port=str(peer.link), timeout_s=TIMEOUT_S * slack)
     driver = make(config) if make is SerialTriggerBox else make(config, ("left",))
-    with pytest.raises(
-        DeviceError, match=r"received 'ID\?'. The line echoes"
-    ) as e:
+    with pytest.raises(DeviceError, match=r"received 'ID\?'. The line echoes") as e:
         driver.connect()
     assert "\\d" not in str(e.value)
     driver.close()
