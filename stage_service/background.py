@@ -1,4 +1,4 @@
-"""What goes on by itself beside the requests, on a thread of its own, until it is closed."""
+"""Threads beside the requests."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import TypeVar
 
 T = TypeVar("T")
 END_S = 5.0
-"""Whoever closes it waits for so long: what is stuck by then is left to the process."""
+"""Seconds that `close` waits for the thread."""
 
 
 class Background(ABC):
-    """A thread that runs `_run`, whose owner starts it; `_changed` guards what it looks at, and
-    wakes it."""
+    """A thread that runs `_run`; its owner starts it. `_changed` guards its data and wakes it."""
 
     def __init__(self, name: str) -> None:
         self._changed = threading.Condition()
@@ -27,7 +26,7 @@ class Background(ABC):
         """Return once `_closed`."""
 
     def close(self) -> None:
-        """End it, or keep it from beginning."""
+        """End the thread, or prevent its start."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -36,7 +35,7 @@ class Background(ABC):
 
 
 def beside(work: Callable[[], T], name: str) -> Future[T]:
-    """What `work` comes to, on a thread of its own where one can be had."""
+    """The future result of `work`, on a thread of its own if one is available."""
     found: Future[T] = Future()
 
     def run() -> None:

@@ -1,7 +1,7 @@
-"""Calibration as an operator does it: what each picture shows of the board, then the solution.
+"""Calibration from the console: the board in each image, then the solution.
 
-The solution is `hairstage calibrate rig`, in a process of its own: it takes long, and a capture
-may begin meanwhile.
+The solution is `hairstage calibrate rig`, in a process of its own, because a capture may start
+meanwhile.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from stage_service.service_models import BoardSize, CalibrationRequest
 from stage_service.signals import tied
 
 LOWER = 10
-"""How much lower than the service's the priority of the process is."""
+"""Niceness of the process above the service's."""
 Point = tuple[float, float]
 ERRORS: dict[str, type[ValueError]] = {
     **dict.fromkeys(("MissingFrame", "NoSilhouette"), MissingFrame),
     **dict.fromkeys(("CalibrationError", "RigError"), CalibrationError),
 }
-"""What an error in the decoder is here, by the name of its class."""
+"""The exception for an error in the decoder, by the name of its class."""
 
 
 class BoardView(BaseModel):
-    """What a camera sees of the board: `corners` of `of`, at `pixels`. Where they tell its pose:
-    `off`, from each to where the lens has it, px; their `rms_px`, and how far the board is tilted
-    from the picture's plane. The pose is fitted to this picture alone."""
+    """The board in a camera's image: `corners` of `of`, at `pixels`. If they determine its pose,
+    which is fitted to this image alone: `off`, the residual of each corner in pixels, their
+    `rms_px`, and the board's tilt from the image plane."""
 
     corners: int
     of: int
@@ -55,8 +55,8 @@ class BoardView(BaseModel):
 
 
 class CalibrationView(BaseModel):
-    """The newest calibration: `stages` are those of its report, `error` is why it came to none.
-    `rig` says whether there is a calibrated rig file, of this one or of one before."""
+    """The newest calibration: the `stages` of its report, or its `error`. `rig`: there is a
+    calibrated rig file, of this or an earlier calibration."""
 
     state: Literal["none", "running", "done", "failed"]
     started: str | None = None
@@ -67,7 +67,7 @@ class CalibrationView(BaseModel):
 
 
 class Calibrating:
-    """One calibration at a time, kept in `root/calibration`; any thread may ask."""
+    """One calibration at a time, stored in `root/calibration`; safe to call from any thread."""
 
     def __init__(self, folder: Path, rig_file: RigFile, events: EventLog, decoder: Decoder) -> None:
         self._folder, self._rig_file, self._events = folder, rig_file, events
@@ -78,11 +78,11 @@ class Calibrating:
 
     @property
     def rig(self) -> Path:
-        """The calibrated rig file, where there is one."""
+        """The path of the calibrated rig file."""
         return self._folder / "rig.json"
 
     def view(self) -> CalibrationView:
-        """How it is with the newest one; after a restart, the report of the last that was done."""
+        """The newest calibration; after a restart, the report of the last successful one."""
         with self._lock:
             view = self._view
         if not self.rig.is_file():
@@ -94,17 +94,17 @@ class Calibrating:
         return view.model_copy(update={"rig": True, "stages": stages, "state": state})
 
     def begin(self, request: CalibrationRequest, path: Callable[[str], Path]) -> CalibrationView:
-        """Calibrate by the captures that are named, whose folders `path` knows; one that runs is
-        ended. Raises what `path` raises, `CalibrationError` for a board that there cannot be."""
+        """Calibrate by these captures, whose folders `path(id)` returns; ends a running
+        calibration. Raises as `path`, and `CalibrationError` for an invalid board."""
         board_of(request.board)
         names = {k: [path(n) for n in getattr(request, k)] for k in ("boards", "diffuse", "mirror")}
         made = self._folder / "next.json"
         words: list[Any] = [*names["boards"], "--rig", self._rig_file.path, "--out", made]
         for kind in ("diffuse", "mirror"):
             words += [f"--{kind}", *names[kind]] if names[kind] else []
-        told = request.model_dump(exclude={"boards", "diffuse", "mirror", "board", "keep_lens"})
-        told |= request.board.model_dump()
-        for name, value in told.items():
+        options = request.model_dump(exclude={"boards", "diffuse", "mirror", "board", "keep_lens"})
+        options |= request.board.model_dump()
+        for name, value in options.items():
             words += [] if value is None else [f"--{name.replace('_', '-')}", value]
         words += ["--keep-lens"] if request.keep_lens else []
         command = [sys.executable, "-m", "stage_service.cli", "calibrate", "rig", "--json"]
@@ -120,7 +120,7 @@ class Calibrating:
         return self.view()
 
     def close(self) -> None:
-        """End the one that runs."""
+        """End a running calibration."""
         with self._lock:
             self._end()
 
@@ -131,7 +131,7 @@ class Calibrating:
             process.wait()
 
     def _run(self, command: list[str], made: Path, started: Future[subprocess.Popen[str]]) -> None:
-        """Start the process, on the thread that it is tied to, and learn what comes of it."""
+        """Start the process, on the thread that it is tied to, and store its result."""
         try:
             with (self._folder / "log").open("w") as log:
                 process = subprocess.Popen(
@@ -142,38 +142,38 @@ class Calibrating:
                     text=True,
                     start_new_session=True,
                 )
-        except Exception as error:  # whoever asked has to know
+        except Exception as error:  # raised in `begin`
             started.set_exception(error)
             return
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, LOWER)
         started.set_result(process)
-        answer, _ = process.communicate()
+        output, _ = process.communicate()
         with self._lock:
-            if self._process is not process:  # it was ended, by the next one or by the service
+            if self._process is not process:  # ended by `_end`
                 return
             update: dict[str, Any] = {"state": "done"}
             try:
                 if process.returncode != 0:
-                    update = {"state": "failed", "error": self._why(answer)}
+                    update = {"state": "failed", "error": self._why(output)}
                 else:
                     for suffix in (".report.json", ".json"):
                         made.with_suffix(suffix).replace(self.rig.with_suffix(suffix))
-            except OSError as error:  # of the disk: the rig that was there is what there is
+            except OSError as error:  # of the disk: the old rig stays
                 update = {"state": "failed", "error": str(error)}
             self._view = self._view.model_copy(update=update)
         self._events.publish("calibration.state", {"state": update["state"]})
 
-    def _why(self, answer: str) -> str:
+    def _why(self, output: str) -> str:
         with suppress(ValueError, LookupError, TypeError):
-            return str(json.loads(answer.splitlines()[-1])["error"]["detail"])
+            return str(json.loads(output.splitlines()[-1])["error"]["detail"])
         lines = (self._folder / "log").read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it ended without a word"
+        return lines[-1] if lines else "the process ended without output"
 
-    def look(self, capture: Path, camera: str, size: BoardSize, calibrated: bool) -> BoardView:
-        """What a camera's lit frame in `capture` shows of the board, by the capture's lens or the
-        calibrated one, where there is one of this camera. Raises `MissingFrame`,
-        `CalibrationError`, `CaptureError`, `DecoderBusy`."""
+    def detect(self, capture: Path, camera: str, size: BoardSize, calibrated: bool) -> BoardView:
+        """Detect the board in a camera's lit frame in `capture`, with the capture's lens or the
+        calibrated one, if there is one. Raises `MissingFrame`, `CalibrationError`, `CaptureError`,
+        `DecoderBusy`."""
         board = board_of(size)
         rig = self.rig if calibrated and self.rig.is_file() else None
         what = board.columns, board.rows, board.square, board.marker, board.dictionary
@@ -184,6 +184,6 @@ class Calibrating:
 
 
 def board_of(size: BoardSize) -> Board:
-    """The board. Raises `CalibrationError` where there can be none."""
+    """The board. Raises `CalibrationError` for an invalid size."""
     square, marker = 1e-3 * size.square_mm, 1e-3 * size.marker_mm
     return Board(size.columns, size.rows, square, marker, size.dictionary)

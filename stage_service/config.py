@@ -1,7 +1,7 @@
-"""The rig file as the service reads it: geometry, the wires, defaults for captures.
+"""The rig file of the service: geometry, devices, safety limits, defaults for captures.
 
-Geometry goes through `reconstruction.geometry.rig`; the tables `[devices]` and `[capture]` are read
-strictly: an unknown or wrong field is an error that names file and field.
+`reconstruction.geometry.rig` reads the geometry. The other tables are strict: an unknown or wrong
+field is an error that names file and field.
 """
 
 from __future__ import annotations
@@ -28,10 +28,8 @@ from reconstruction.containment import LONGEST_NAME
 from reconstruction.geometry.rig import RigError
 from stage_service.wire_names import unfit_projectors, unfit_serials
 
-SHORTEST_S, LONGEST_S = 1e-6, 10.0
-"""Exposures that the trigger box makes."""
-PROJECTOR_LEVELS = 65535
-"""Above 0, on the projector controller's wire."""
+SHORTEST_S, LONGEST_S = 1e-6, 10.0  # the trigger box's range of exposures
+PROJECTOR_LEVELS = 65535  # above 0, on the projector controller's wire
 Exposure = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -39,7 +37,7 @@ Seconds = Annotated[float, Field(gt=0.0)]
 Baud = Annotated[int, Field(ge=300, le=100_000_000)]
 Address = Annotated[int, Field(ge=0, le=65535)]
 Text = StringConstraints(strip_whitespace=True)
-"""Of which blanks are nothing: they are nobody's name, and say nothing."""
+"""Text without blanks at its ends."""
 Names = Annotated[
     tuple[Annotated[str, Field(max_length=LONGEST_NAME)], ...], Field(max_length=4096)
 ]
@@ -52,18 +50,17 @@ class Strict(BaseModel):
 
 
 OWNER_WORDS = 17
-"""Registers that say who has a bank: a number, then 32 characters of ASCII."""
+"""The owner's registers: a number, then 32 characters of ASCII."""
 
 
 class LightRegisters(Strict):
     """`[devices.lights.registers]`: Modbus addresses, by default those of docs/reference/wire.md.
 
     Holding registers, then input registers; `levels`, `coils`, `table` and `owner` are the first of
-    many. Without `owner` services of several machines do not see each other.
-    None, "none" in TOML: the bank has no such register. Without `selector` lamps are put on by
-    coils; without `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back,
-    without `sequence`, `table` and `position` no hardware stepping. `signature` is (address,
-    value), checked at `connect`.
+    several. None, "none" in TOML: the bank has no such register. Without `selector` coils switch
+    the lamps; without `heartbeat` and `watchdog` there is no dead-man, without `lit` no read-back,
+    without `sequence`, `table` and `position` no hardware stepping, without `owner` no protection
+    against services of other machines. `signature` is (address, value), checked at `connect`.
     """
 
     coils: Address = 0
@@ -90,10 +87,9 @@ class LightRegisters(Strict):
 
 
 class _LightBank(Strict):
-    """What every light bank has. `settle_s` passes between lamp and pulse.
+    """Fields of every light bank. `settle_s` passes between lamp and pulse.
 
-    A bank without read-back or dead-man cannot guarantee a blackout; it is refused unless the
-    operator accepts that here.
+    A bank without read-back or dead-man is refused unless `accept_unverified_blackout` is set.
     """
 
     timeout_s: Seconds = 1.0
@@ -106,7 +102,7 @@ class _LightBank(Strict):
         return False
 
     def level_steps(self, by_table: bool = False) -> int:
-        """How many levels above 0 it tells apart; 1: lamps are always at full level."""
+        """Its number of levels above 0; 1: lamps are always at full level."""
         return 1
 
 
@@ -115,12 +111,10 @@ class _ModbusConfig(_LightBank):
 
     @property
     def sequences(self) -> bool:
-        """Whether it has a sequence table, which the trigger box's gate steps."""
         r = self.registers
         return None not in (r.sequence, r.table, r.position)
 
     def level_steps(self, by_table: bool = False) -> int:
-        """How many levels above 0 it tells apart; entries of its table have their own."""
         r = self.registers
         return 1 if r.levels is None and not by_table else r.level_full
 
@@ -148,8 +142,7 @@ class ModbusRtuConfig(_ModbusConfig):
 class DmxConfig(_LightBank):
     """`[devices.lights]`: lamps on DMX channels `first_channel` … through an Enttec USB Pro.
 
-    A command is over when the frame under way and its own are out: 50 ms at the widget's 40 frames
-    a second.
+    A command takes two frames: 50 ms at the widget's 40 frames per second.
     """
 
     kind: Literal["dmx_enttec"]
@@ -157,7 +150,6 @@ class DmxConfig(_LightBank):
     first_channel: int = Field(default=1, ge=1, le=512)
 
     def level_steps(self, by_table: bool = False) -> int:
-        """DMX has 8 bits."""
         return 255
 
 
@@ -180,10 +172,8 @@ class SerialConfig(Strict):
 
 
 class PjLinkConfig(Strict):
-    """`[devices.pjlink.<projector>]`: power and lamp hours; nothing of a capture's timing.
-
-    The password stands in a file of its own, not in the rig file.
-    """
+    """`[devices.pjlink.<projector>]`: power and lamp hours. The password is in a file of its
+    own."""
 
     host: str = Field(min_length=1)
     port: Port = 4352
@@ -194,7 +184,7 @@ class PjLinkConfig(Strict):
 class _Cameras(Strict):
     """`readout_s` (sensor, per frame) and `bytes_per_s` (all cameras together) are for predictions.
 
-    `buffers` is how many frames a camera holds unread; it bounds a hardware-stepped run.
+    `buffers`: unread frames that a camera can hold; it limits a hardware-stepped run.
     """
 
     timeout_s: Seconds = 2.0
@@ -206,7 +196,7 @@ class _Cameras(Strict):
 class LinkCamerasConfig(_Cameras):
     """`[devices.cameras]`: the camera link.
 
-    `timeout_s` bounds each answer, `busy_s` how long a camera may say that its frame is not ready.
+    `timeout_s` is the deadline of each reply, `busy_s` that of a frame which is not ready.
     """
 
     kind: Literal["link"] = "link"
@@ -218,11 +208,10 @@ class LinkCamerasConfig(_Cameras):
 class BaslerConfig(_Cameras):
     """`[devices.cameras]`: Basler cameras, found by serial number.
 
-    `serials` maps each camera of the rig file to its number. `gain` is counts per
-    (W/(sr m²) · s) and `black` counts: calibrated, the camera knows neither. `features` are written
-    to the camera in their order after its default settings are loaded: region of interest, analog
-    gain, black level, packet size. `timeout_s` bounds arming; a frame may come `frame_s` later than
-    its exposure takes.
+    `serials` maps each camera of the rig file to its number. `gain`, counts per (W/(sr m²) · s),
+    and `black`, counts, are calibrated. `features` are written to the camera in their order after
+    its default settings: region of interest, analog gain, black level, packet size. `timeout_s` is
+    the deadline of arming; a frame may come `frame_s` after its exposure.
     """
 
     kind: Literal["basler"]
@@ -249,10 +238,10 @@ CamerasConfig = Annotated[LinkCamerasConfig | BaslerConfig, Field(discriminator=
 
 
 class DevicesConfig(Strict):
-    """`[devices]`: how to reach the stage. Without `projectors` there are no sweeps.
+    """`[devices]`: the stage's devices. Without `projectors` there are no sweeps.
 
-    `hardware_stepping` says that the trigger box's gates are wired to the light bank and to the
-    projectors, so that the box can clock a sequence by itself.
+    `hardware_stepping`: the trigger box's gates are wired to the light bank and the projectors, so
+    that the box can clock a sequence.
     """
 
     hardware_stepping: bool = False
@@ -297,7 +286,7 @@ class Levels(Strict):
 
 
 class CaptureDefaults(Strict):
-    """`[capture]`: what a plan gets where it does not say otherwise."""
+    """`[capture]`: the defaults of a plan."""
 
     tracking_every: int = Field(default=10, ge=0)
     retries: int = Field(default=2, ge=0, le=20)
@@ -307,7 +296,7 @@ class CaptureDefaults(Strict):
 
 
 class SafetyLimits(Strict):
-    """`[safety]`: what the lamps may do, checked in the plan and while running.
+    """`[safety]`: the lamps' limits, checked in the plan and during a run.
 
     One lamp is lit for at most `max_on_s` at a time and `max_duty` of any `duty_window_s`; at most
     `max_lamps` are lit at once, and `max_power_w` drawn at `lamp_power_w` a lamp at full level.
@@ -325,7 +314,7 @@ class SafetyLimits(Strict):
 
 @dataclass(frozen=True, eq=False)
 class RigFile:
-    """A rig file, read: `devices` is None where the file describes geometry alone."""
+    """The content of a rig file; `devices` is None if it has only geometry."""
 
     path: Path
     rig: Rig
@@ -366,7 +355,7 @@ def load_rig_file(path: str | Path, devices: str | Path | None = None) -> RigFil
 
 
 def _check_names(path: Path, rig: Rig, devices: DevicesConfig | None) -> None:
-    """Raise `RigError` for names of the rig that its devices' wires cannot carry."""
+    """Raise `RigError` for names that the devices' wires cannot carry."""
     unfit: list[str] = []
     if devices is not None and devices.projectors is not None:
         unfit += unfit_projectors([p.name for p in rig.projectors])
@@ -387,7 +376,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
-    """The field's place in the file; pydantic adds the kind of the table."""
+    """The field's path in the file, without the table's kind, which pydantic adds."""
     return ".".join(str(p) for p in loc if p not in _KINDS)
 
 

@@ -1,4 +1,4 @@
-"""Files and names that requests give: read, and refused with where they stand."""
+"""Files and names in requests: read and checked, with the field in each error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stage_service.jobs.records import PipelineRequest
 
 
 class BadInput(ValueError):
-    """A file that a request names cannot be used; the message names it and says why."""
+    """A file or name in a request cannot be used."""
 
 
 def read_head(path: Path, decoder: Decoder) -> Mesh:
@@ -45,7 +45,7 @@ def read_masks(folder: Path, rig: Rig, decoder: Decoder) -> dict[str, Bools]:
 
 
 def check_kept(capture: str) -> None:
-    """Raises `BadInput` for the snapshot, of which nothing is to be made that lasts."""
+    """Raises `BadInput` for the snapshot, which the next one replaces."""
     if capture == SNAPSHOT:
         raise BadInput("capture: a snapshot is kept until the next one only: shoot a capture")
 
@@ -55,19 +55,17 @@ def check_new(pipeline: PipelineRequest, rig: Rig, head: bool) -> None:
     check_named(pipeline, rig)
     if "reconstruct" not in PIPELINES[pipeline.name]:
         raise BadInput(
-            f"pipeline: {pipeline.name!r} works on strands that are there already; "
-            "a new capture has none"
+            f"pipeline: {pipeline.name!r} needs existing strands; a new capture has none"
         )
     method = pipeline.options.method
     if not head and method in ("light_planes", "fused"):
         raise BadInput(
-            f"pipeline: {method!r} roots strands on a scalp: give the head, or the method "
-            "'auto', which takes what there is"
+            f"pipeline: {method!r} roots strands on a scalp: give the head, or the method 'auto'"
         )
 
 
 def check_named(pipeline: PipelineRequest, rig: Rig) -> None:
-    """Raises `BadInput` where options name what the rig has not, or a file that is not there."""
+    """Raises `BadInput` where options name what the rig lacks, or a missing file."""
     options = pipeline.options
     for kind, wanted, known in (
         ("held_out_cameras", options.held_out_cameras, rig.cameras),
@@ -76,12 +74,12 @@ def check_named(pipeline: PipelineRequest, rig: Rig) -> None:
         unknown = set(wanted) - {x.name for x in known}
         if unknown:
             raise BadInput(f"pipeline.options.{kind}: the rig has no {sorted(unknown)}")
-    asked = options.reconstruct
+    strands = options.reconstruct
     for field, file in (
         ("truth", options.truth),
         ("environment", None if options.environment in PROCEDURAL else options.environment),
-        ("reconstruct.head_mesh", asked.head_mesh),
-        ("reconstruct.scalp_points", asked.scalp_points),
+        ("reconstruct.head_mesh", strands.head_mesh),
+        ("reconstruct.scalp_points", strands.scalp_points),
     ):
         try:
             if file is not None and not (field == "truth" and Path(file).is_dir()):

@@ -1,4 +1,4 @@
-"""The lease as the seam has it: who steers alone, in callers' names, and everybody told."""
+"""The lease in callers' names, with an event for each change."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ class Leasing:
         self._control, self._events = control, events
 
     def view(self) -> LeaseView:
-        """Who steers, if anybody in particular."""
+        """The present lease."""
         held = self._control.leases.current
         if held is None:
             return LeaseView(holder=None, expires=None)
         return LeaseView(holder=held.holder, expires=held.expires)
 
     def take(self, request: LeaseRequest, by: Caller) -> LeaseGrant:
-        """Steer alone for some time. Raises `Leased`, `NotRecorded`."""
+        """Take the lease. Raises `Leased`, `NotRecorded`."""
         work = partial(self._control.leases.take, request.holder, request.seconds)
         detail = f"{request.holder}, {request.seconds:g} s"
         lease = self._control.do(by, "lease.take", work, detail=detail, steers=False)
         return self._granted(lease, lease.token)
 
     def renew(self, request: RenewRequest, by: Caller) -> LeaseGrant:
-        """Let the caller's lease end so many seconds from now. Raises `NoLease`, `NotRecorded`."""
+        """Extend the caller's lease. Raises `NoLease`, `NotRecorded`."""
         token = by.token or ""
         work = partial(self._control.leases.renew, token, request.seconds)
         detail = f"{request.seconds:g} s"
@@ -43,22 +43,22 @@ class Leasing:
         by.require("steer")
         work = partial(self._control.leases.release, by.token or "")
         self._control.do(by, "lease.release", work, steers=False)
-        return self._tell()
+        return self._publish()
 
     def end(self, by: Caller) -> LeaseView:
-        """End the lease whoever holds it. Raises `Forbidden`, `NoLease`."""
+        """End any caller's lease. Raises `Forbidden`, `NoLease`."""
         by.require("admin")
         held = self._control.leases.current
         detail = "" if held is None else f"held by {held.holder}"
         work = self._control.leases.end
         self._control.do(by, "lease.end", work, detail=detail, steers=False)
-        return self._tell()
+        return self._publish()
 
     def _granted(self, lease: Lease, token: str) -> LeaseGrant:
-        self._tell()
+        self._publish()
         return LeaseGrant(token=token, holder=lease.holder, expires=lease.expires)
 
-    def _tell(self) -> LeaseView:
+    def _publish(self) -> LeaseView:
         view = self.view()
         self._events.publish("stage.lease", view.model_dump())
         return view

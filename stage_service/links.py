@@ -1,5 +1,5 @@
-"""Links in the store: listed with where they lead, removed as links, and nothing is read through
-one that leads out of its folder.
+"""Symbolic links in the store: listed with their target, removed as links, never read if they lead
+out of their folder.
 
 `captures/`, `models/`, `uploads/` and the root may themselves be links, to a larger disk.
 """
@@ -13,23 +13,21 @@ from pathlib import Path
 from reconstruction.reading import printable
 
 MOST_NAMED = 20
-"""Links that a list names: the first is enough to find the others."""
+"""Links that a list names."""
 
 
 class LeadsOutside(ValueError):
-    """A capture, model or upload is a link, or has links that lead out of it; says which."""
+    """A capture, model or upload is a link, or has links that lead out of it."""
 
 
 def target_of(path: Path) -> str | None:
-    """Where a link leads, as it is written in it; None for what is no link."""
+    """A link's target as written; None for anything else."""
     return printable(str(path.readlink())) if path.is_symlink() else None
 
 
 def outward(folder: Path) -> list[str]:
-    """The links below `folder` that lead out of it, or nowhere: "name -> where"; the first of them.
-
-    Folders that are links are not entered.
-    """
+    """The first links below `folder` that lead out of it, or nowhere, as "name -> target". Linked
+    folders are not entered."""
     root, found = folder.resolve(), []
     for place, folders, files in os.walk(folder):
         for name in sorted([*folders, *files]):
@@ -51,7 +49,7 @@ def check_link(what: str, path: Path) -> None:
 
 
 def check_links(what: str, path: Path) -> None:
-    """The same, also where a link below it leads out of it."""
+    """Raise `LeadsOutside` where `path` is a link, or a link below it leads out of it."""
     check_link(what, path)
     if found := outward(path):
         raise LeadsOutside(
@@ -61,7 +59,7 @@ def check_links(what: str, path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a link itself, never what it leads to; else a file, or a folder with all in it."""
+    """Remove a link (never its target), a file, or a folder with its content."""
     if path.is_symlink() or not path.is_dir():
         path.unlink()
     else:
@@ -71,5 +69,5 @@ def remove(path: Path) -> None:
 def _inside(path: Path, root: Path) -> bool:
     try:
         return path.resolve(strict=True).is_relative_to(root)
-    except (OSError, RuntimeError):  # it leads nowhere, or round and round
+    except (OSError, RuntimeError):  # no target, or a loop
         return False

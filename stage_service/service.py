@@ -1,4 +1,4 @@
-"""The one seam between the routes and the rest of the service. Knows no HTTP."""
+"""The only interface between the routes and the rest of the service; independent of HTTP."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from reconstruction import Capture, CaptureError
+from reconstruction import CaptureError
 from reconstruction.calibration.boards import CalibrationError
 from reconstruction.containment import inside, is_file_name
 from stage_service.acquisition.states import CaptureStatus, Outcome
-from stage_service.calibrating import BoardView, Calibrating, CalibrationView
+from stage_service.calibrating import Calibrating, CalibrationView
 from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Caller, Control
 from stage_service.captures.manager import CaptureManager
-from stage_service.captures.may_light import Moment, Word
+from stage_service.captures.may_light import Moment
 from stage_service.captures.snapshots import SNAPSHOT, one_step
 from stage_service.config import RigFile
 from stage_service.decoding import Decoder
-from stage_service.frames import FrameFigures, UnknownFrame, read_frame, steps_of
-from stage_service.inputs import BadInput, check_kept, check_new, read_head, read_masks
+from stage_service.frames import Frames
+from stage_service.inputs import BadInput, check_kept
 from stage_service.jobs.follower import JobFollower
 from stage_service.jobs.queue import JobQueue, NoSuchJob
 from stage_service.leasing import Leasing
@@ -32,22 +31,20 @@ from stage_service.links import check_link
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import PlanCost
 from stage_service.plan.resolved import resolve
+from stage_service.preparing import prepare
 from stage_service.queueing import Queueing, then
 from stage_service.records.audit import Action
 from stage_service.records.events import EventLog
 from stage_service.records.refusals import Refusals
 from stage_service.service_models import (
     AcknowledgeRequest,
-    BoardQuery,
     CalibrationRequest,
     CaptureRequest,
     CaptureView,
     Health,
-    LatchView,
     QueueRequest,
     RigView,
     SnapshotRequest,
-    StepView,
 )
 from stage_service.stopping import NotEnded, Step, end_all
 from stage_service.storage import NotThere, Storage
@@ -57,25 +54,23 @@ from stage_service.verification import Verification, Verifier
 from stage_service.viewer import RemoteViewing, Source, Tracer
 from stage_service.watching import NotReady, Watching
 
-T = TypeVar("T")
 FLUSH_S = 0.5
-"""The end of the service waits for so long for the audit log's disk."""
+"""Seconds that the end of the service waits for the audit log's disk."""
 LIGHTS_S = 6.0
-"""And for so long for a capture's end: until lamps and projectors are read back dark, its folder is
-finished and the stage given up (`STOP_WITHIN_S`, `TIDY_S`, `RELEASE_S`)."""
+"""For a capture's end: lamps and projectors read back dark, folder finished, stage released
+(`STOP_WITHIN_S`, `TIDY_S`, `RELEASE_S`)."""
 OTHERS_S = 3.0
-"""And for all that lights nothing, beside that."""
+"""For everything else, in parallel."""
 READ_S = 1.0
-"""A start waits for so long for the captures on the disk; the others are read beside it."""
+"""Seconds that a start waits for the captures on the disk; the rest is read in the background."""
 
 
 class Service:
-    """The captures, jobs and devices of one root folder, for routes and whoever else shows them.
+    """The captures, jobs and devices of one root folder.
 
-    `start()` puts the lights off, looks what is on the disk and then follows the jobs, whose
-    database nothing else waits for; `close()` puts the lights off again and may be called more than
-    once, from any thread. What steers the stage is done in a caller's
-    name, recorded, and refused (`Leased`) while somebody else holds the lease.
+    `start()` puts the lights off, reads the captures on the disk and follows the jobs; `close()`
+    puts the lights off again and may be called repeatedly, from any thread. Steering the stage is
+    recorded in the caller's name, and raises `Leased` while another caller holds the lease.
     """
 
     def __init__(
@@ -85,7 +80,6 @@ class Service:
         *,
         take_over: bool = False,
         gpu_workers: bool = False,
-        verify_days: float | None = None,
     ) -> None:
         self.rig_file, self.root = rig_file, root
         self._captures = CaptureManager(
@@ -93,7 +87,7 @@ class Service:
         )
         self._has_stage = False
         self._control = Control(self._captures.audit, self._captures.leases)
-        self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepared)
+        self.queue = Queueing(root / "queue.json", self._captures, self._control, self._prepare)
         self._queue = JobQueue(root, gpu_workers=gpu_workers)
         self._follower = JobFollower(root, self._queue, self._captures.events, self._captures.audit)
         self.jobs = Submitting(
@@ -111,29 +105,23 @@ class Service:
             self.decoder,
             self._tracer,
         )
-        self._verifier = Verifier(
-            root / "verified.json",
-            self._captures.events,
-            lambda: self._captures.running is not None,
-            lambda: [c for c in self._captures.list() if c.outcome == "completed"],
-            verify_days,
-        )
+        self._verifier = Verifier(self.events, lambda: self._captures.running is not None)
         self.calibrating = Calibrating(root / "calibration", rig_file, self.events, self.decoder)
+        self.frames = Frames(self.capture_path, self.decoder, self.calibrating)
         self._closing = threading.Lock()
         self._stopping = self._closed = False
         self.not_ended: list[str] = []  # while it closes, and afterwards
 
     @property
     def events(self) -> EventLog:
-        """Everything that happened to captures and jobs since the service started."""
+        """The events since the service started."""
         return self._captures.events
 
     def start(self) -> None:
-        """Lights off; then, beside all else, what is on the disk, and the jobs: what a crash kept
-        from being enqueued, and what becomes of them. What waits for the stage begins when all
-        captures have been read.
+        """Put the lights off; then, in the background, read the captures on the disk, enqueue jobs
+        that a crash left pending, and follow all jobs. The queue starts once all captures are read.
 
-        Raises `StageInUse`, and touches nothing, where another service has the stage.
+        Raises `StageInUse`, before any command, while another service has the stage.
         """
         if not self._has_stage:
             self.take_stage()
@@ -154,27 +142,27 @@ class Service:
         self.events.publish("captures.read", {"count": len(known)})
 
     def moment(self) -> Moment:
-        """When a request comes: no blackout after it is undone by what it asks for."""
+        """The moment of a request: a later blackout overrides it."""
         return self._captures.moment()
 
     @property
     def unread(self) -> int:
         """Captures on the disk that are not listed yet."""
-        return self._captures.catalogue.unread
+        return self._captures.unlisted
 
     @property
     def running(self) -> str | None:
-        """The id of the capture that is being shot; waits for nothing."""
+        """The id of the running capture; does not block."""
         return self._captures.running
 
     def take_stage(self) -> None:
-        """Have the stage for this service alone. Raises `StageInUse`."""
+        """Take the stage for this service. Raises `StageInUse`."""
         self._captures.stage.take()
         self._has_stage = True
 
     def close(self) -> None:
-        """Lights off and what runs aborted, and beside it everything else ended, each in its time
-        (`LIGHTS_S`, `OTHERS_S`, `FLUSH_S`): what has not ended by then is in `not_ended`."""
+        """Put the lights off, abort the running capture and end everything else, in parallel, each
+        within its limit (`LIGHTS_S`, `OTHERS_S`, `FLUSH_S`); `not_ended` lists the rest."""
         self._stopping = True
         with self._closing:
             if self._closed:
@@ -183,7 +171,7 @@ class Service:
                 [
                     Step("lamps and capture", self._close_captures, LIGHTS_S),
                     Step("the queue", self.queue.close, OTHERS_S),
-                    Step("reading captures again", self._verifier.close, OTHERS_S),
+                    Step("the verifier", self._verifier.close, OTHERS_S),
                     Step("the calibration", self.calibrating.close, OTHERS_S),
                     Step("the decoder", self.decoder.close, OTHERS_S),
                     Step("the tracer", self._tracer.close, OTHERS_S),
@@ -208,45 +196,21 @@ class Service:
         self._control.audit.flush(FLUSH_S)
 
     def validate(self, plan: CapturePlan) -> PlanCost:
-        """Cost a plan without touching a device. Raises `PlanError`."""
+        """The cost of a plan; uses no device. Raises `PlanError`."""
         return resolve(plan, self.rig_file).cost
 
     def start_capture(self, request: CaptureRequest, by: Caller) -> CaptureView:
-        """Begin a capture. Raises `BadInput`, `Leased`, and what `CaptureManager.start` raises;
-        `Forbidden` for a pipeline without the scope "jobs", or arming without "arm"."""
+        """Start a capture. Raises `BadInput`, `Leased`, as `CaptureManager.start`, and `Forbidden`
+        for a pipeline without the scope "jobs" or arming without "arm"."""
         word = self._control.word(by, "capture", request.armed_by)
         if request.pipeline is not None:
             by.require("jobs")
-        work = partial(self._prepared(request), word)
+        work = partial(self._prepare(request), word)
         capture = self._control.do(by, "capture.start", work, None, detail=then(request))
         return self.capture(capture)
 
-    def _prepared(self, request: CaptureRequest | QueueRequest) -> Callable[..., str]:
-        """What starts the capture on a word, its head and masks read. Raises `BadInput`,
-        `NotThere`, `NoStage`."""
-        _ = self._captures.stage.devices  # of no use without: what waits would wait for ever
-        given, folder = request.head, request.masks
-        if request.upload is not None:
-            if given is not None or folder is not None:
-                raise BadInput("upload: give this, or head and masks; not both")
-            given, folder = self.storage.uploaded(request.upload)
-        if request.pipeline is not None:
-            check_new(request.pipeline, self.rig_file.rig, given is not None)
-        head = None
-        if given is not None:
-            head = read_head(given, self.decoder)
-        masks = None
-        if folder is not None:
-            masks = read_masks(folder, self.rig_file.rig, self.decoder)
-        asked = {"pipeline": request.pipeline.to_dict()} if request.pipeline is not None else {}
-
-        def start(word: Word, **more: str) -> str:
-            extra = {**asked, **more}
-            return self._captures.start(
-                request.plan, head=head, masks=masks, extra=extra, word=word
-            )
-
-        return start
+    def _prepare(self, request: CaptureRequest | QueueRequest) -> Callable[..., str]:
+        return prepare(request, self._captures, self.storage, self.decoder)
 
     def capture(self, capture_id: str) -> CaptureView:
         """A capture's status. Raises `UnknownCapture`."""
@@ -255,8 +219,7 @@ class Service:
     def captures(
         self, limit: int, offset: int = 0, outcome: Outcome | None = None
     ) -> list[CaptureView]:
-        """The latest `limit` captures, of that outcome, before the `offset` newest; oldest
-        first."""
+        """`limit` captures of that outcome before the `offset` newest; oldest first."""
         known = self._captures.list()
         if outcome is not None:
             known = [status for status in known if status.outcome == outcome]
@@ -264,8 +227,8 @@ class Service:
         return [self._view(status) for status in known[max(0, end - limit) : end]]
 
     def snapshot(self, request: SnapshotRequest, by: Caller) -> CaptureView:
-        """Begin one exposure to look at: the capture "snapshot", which the next one replaces.
-        Raises `PlanError`, `Busy`, `Unsafe`, `Leased`."""
+        """Start a single exposure as the capture "snapshot", which the next one replaces. Raises
+        `PlanError`, `Busy`, `Unsafe`, `Leased`."""
         plan = one_step(self.rig_file, request.light, request.exposure, request.level)
         word, detail = self._control.word(by, "snapshot"), request.light or "all lights"
         work = partial(self._captures.snapshot, plan, word)
@@ -277,68 +240,34 @@ class Service:
         return self._view(self._control.do(by, "capture.pause", work, capture_id))
 
     def resume(self, capture_id: str, by: Caller, armed_by: str | None = None) -> CaptureView:
-        """Go on after a pause; of a capture that did not complete, shoot the frames it lacks.
-        Raises `Forbidden` for arming without the scope "arm"."""
+        """Resume after a pause; for an incomplete capture, shoot the missing frames. Raises
+        `Forbidden` for arming without the scope "arm"."""
         word = self._control.word(by, "resume", armed_by)
         work = partial(self._captures.resume, capture_id, word)
         status = self._control.do(by, "capture.resume", work, capture_id)
-        self._verifier.forget(capture_id)  # what was found wrong may be what is shot now
+        self._verifier.forget(capture_id)  # its problems may be what is shot now
         return self._view(status)
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:
-        """Abort at the next step boundary; anybody may. Raises `UnknownCapture`, `WrongState`."""
+        """Abort at the next step boundary; every caller may. Raises `UnknownCapture`,
+        `WrongState`."""
 
         def work() -> CaptureStatus:
-            self._captures.get(capture_id)  # one that there is not holds nothing up
+            self._captures.get(capture_id)  # raises before the queue is held
             self.queue.hold(f"abort of capture {capture_id} by {by}")
             return self._captures.abort(capture_id)
 
         return self._view(self._control.do(by, "capture.abort", work, capture_id, steers=False))
 
     def _view(self, status: CaptureStatus) -> CaptureView:
-        """The status together with the job that follows it; asks no database."""
+        """The status and the capture's job; does not query the database."""
         return CaptureView(**status.model_dump(), job=self._follower.job_after(status.id))
 
     def _completed(self, status: CaptureStatus) -> None:
         self._follower.follow_up(status)
 
-    def frame(self, capture_id: str, step: int, camera: str, read: Callable[[Path], T]) -> T:
-        """What `read` makes of a frame's EXR file, wherever compression has just put it.
-
-        Raises `UnknownCapture`, `UnknownFrame`, `MissingFrame`; `CaptureError` where the file is
-        gone or cannot be read.
-        """
-        return read_frame(Capture(self.capture_path(capture_id)), step, camera, read)
-
-    def preview(self, capture_id: str, step: int, camera: str, **look: Any) -> bytes:
-        """A PNG of a frame, as `png_of_frame` makes it. Raises as `frame`, and `DecoderBusy`."""
-        return self.frame(capture_id, step, camera, partial(self.decoder.preview, **look))
-
-    def figures(self, capture_id: str, step: int, camera: str) -> FrameFigures:
-        """How a frame is exposed. Raises as `frame`, and `DecoderBusy`."""
-
-        def read(file: Path) -> FrameFigures:
-            return FrameFigures.model_validate(self.decoder.figures(file))
-
-        return self.frame(capture_id, step, camera, read)
-
-    def steps(self, capture_id: str) -> list[StepView]:
-        """What a capture shoots, in order, and which frames it has. Raises `UnknownCapture`,
-        `CaptureError`."""
-        return steps_of(Capture(self.capture_path(capture_id)))
-
-    def board(self, capture_id: str, camera: str, board: BoardQuery) -> BoardView:
-        """What a camera saw of a calibration's board. Raises as `frame`, and `BadInput`."""
-        capture = Capture(self.capture_path(capture_id))
-        if camera not in [c.name for c in capture.rig.cameras]:
-            raise UnknownFrame(f"{capture_id} has no camera {camera!r}")
-        try:
-            return self.calibrating.look(capture.path, camera, board, board.calibrated)
-        except CalibrationError as error:
-            raise BadInput(str(error)) from error
-
     def calibrate(self, request: CalibrationRequest, by: Caller) -> CalibrationView:
-        """Begin to calibrate the rig. Raises `UnknownCapture`, `NotFinished`, `BadInput`."""
+        """Start a calibration of the rig. Raises `UnknownCapture`, `NotFinished`, `BadInput`."""
         work = partial(self.calibrating.begin, request, self.done_capture)
         what = f"{len(request.boards)} boards, {len(request.diffuse + request.mirror)} spheres"
         try:
@@ -349,18 +278,19 @@ class Service:
     def calibrated(self) -> Path:
         """The calibrated rig file. Raises `NotThere`."""
         if not self.calibrating.rig.is_file():
-            raise NotThere("no rig has been calibrated here yet")
+            raise NotThere("there is no calibrated rig yet: start a calibration")
         return self.calibrating.rig
 
     def done_capture(self, capture_id: str) -> Path:
-        """The folder of a capture that nobody shoots. Raises `UnknownCapture`, `NotFinished`."""
+        """The folder of a capture that is not being shot. Raises `UnknownCapture`,
+        `NotFinished`."""
         path = self.capture_path(capture_id)
         if self._captures.running == capture_id:
             raise NotFinished(f"capture {capture_id} is being shot")
         return path
 
     def remove_capture(self, capture_id: str, by: Caller, *, dry_run: bool) -> Removed:
-        """Put a capture into the trash. Raises as `Storage.remove_capture`, and `BadInput` for a
+        """Move a capture into the trash. Raises as `Storage.remove_capture`, and `BadInput` for a
         snapshot."""
         check_kept(capture_id)
         pending = self._follower.is_pending
@@ -371,20 +301,20 @@ class Service:
         return removed
 
     def verify(self, capture_id: str, by: Caller) -> Verification:
-        """Have every file of a capture read again. Raises as `done_capture`, and `BadInput` for a
+        """Verify every file of a capture. Raises as `done_capture`, and `BadInput` for a
         snapshot."""
         check_kept(capture_id)
-        work = partial(self._verifier.ask, capture_id, self.done_capture(capture_id))
+        work = partial(self._verifier.submit, capture_id, self.done_capture(capture_id))
         return self._control.do(by, "capture.verify", work, capture_id, steers=False)
 
     def verification(self, capture_id: str) -> Verification:
-        """What was found when a capture was last read again. Raises `UnknownCapture`."""
+        """The newest verification of a capture. Raises `UnknownCapture`."""
         self.capture_path(capture_id)
         return self._verifier.get(capture_id)
 
     def capture_path(self, capture_id: str) -> Path:
-        """The capture's folder; one that was put there by hand or by `import` counts too. Raises
-        `UnknownCapture`, `LeadsOutside` for a link."""
+        """The capture's folder, also one added by hand or by `import`. Raises `UnknownCapture`,
+        `LeadsOutside` for a link."""
         try:
             path = self._captures.path(capture_id)
         except UnknownCapture:
@@ -399,8 +329,8 @@ class Service:
         return path
 
     def _viewed(self, name: str) -> Source:
-        """Where a model for the viewer lies, with the capture of its name or of the job that made
-        it. Raises `NotThere`."""
+        """The folder of a model for the viewer, with its capture: of the same name, or of its job.
+        Raises `NotThere`."""
         model, captures = self.storage.whole_model(name).path, list[Path]()
         with suppress(UnknownCapture, CaptureError):
             captures.append(self.capture_path(name))
@@ -410,17 +340,18 @@ class Service:
         return Source(model, tuple(captures))
 
     def devices(self) -> dict[str, Any]:
-        """Each device and whether it answers; "safety": whether the lamps are known to be off."""
+        """Each device's status, see `CaptureManager.devices`."""
         return self._captures.devices()
 
     def blackout(self, by: Caller) -> dict[str, Any]:
-        """All lamps and projectors off, verified; aborts a running capture. Anybody may."""
+        """Put all lamps and projectors off, verified; aborts a running capture. Every caller
+        may."""
         self.queue.hold(f"blackout by {by}")
         return self._control.blackout(by, self._captures.blackout)
 
     def acknowledge(self, request: AcknowledgeRequest, by: Caller) -> dict[str, Any]:
-        """Take a person's word that the lamps are off. They may still be at the stage: what waits
-        begins when somebody says so, as after a blackout. Raises `CannotAcknowledge`, `Leased`."""
+        """Accept a person's word that the lamps are off; holds the queue, because they may still be
+        at the stage. Raises `CannotAcknowledge`, `Leased`."""
         stage, said = self._captures.stage, f"{request.name}: {request.note}"
 
         def work() -> None:
@@ -432,46 +363,24 @@ class Service:
         return self._captures.safety()
 
     def record_login(self, by: Caller, action: str) -> Future[None]:
-        """Note in the audit log who logged in or out; done once that is on the disk."""
+        """Record a login or logout in the audit log; done once it is on the disk."""
         return self._control.audit.later(str(by), action, "service")
 
     def audit(self, limit: int) -> list[Action]:
-        """The newest actions on the stage, refused ones too; the oldest of them first."""
+        """The newest actions on the stage, refused ones included; oldest first."""
         return self._control.audit.latest(limit)
 
     def health(self) -> Health:
-        """How service, lamps and jobs are; asks no device, no database, waits for no disk."""
-        free_bytes, worker = self.watching.disk()
-        lamps, latched = self._captures.safety(), self._captures.stage.latch.latched
-        problems = [p for p in (self._queue.set_aside, self._queue.problem) if p is not None]
-        if self._stopping:
-            problems.insert(0, "the service is stopping: it lights nothing any more")
-        if damaged := self._verifier.damaged:
-            problems.append(f"damaged when they were last read again: {', '.join(damaged[:5])}")
-        if latched is not None:
-            problems.insert(0, latched.detail)
-        return Health(
-            status="unsafe" if latched else "degraded" if problems else "ok",
-            version=version("hairstage"),
-            rig=self.rig_file.rig.name,
-            root=str(self.root),
-            worker=worker,
-            capture=self._captures.running,
-            unread=self.unread,
-            lamps=lamps["state"],
-            lamps_detail=lamps["detail"],
-            lamps_accepted=lamps["accepted"],
-            latch=LatchView.of(latched),
-            disk_free_bytes=free_bytes,
-            problems=problems,
-        )
+        """The state of service, lamps and jobs; queries no device and no database, waits for no
+        disk."""
+        return self.watching.health(stopping=self._stopping, damaged=self._verifier.damaged)
 
     def rig(self) -> RigView:
-        """Where lights, cameras and projectors stand."""
+        """The poses of lights, cameras and projectors, and defaults of plans."""
         return RigView.of(self.rig_file)
 
     def ready(self) -> None:
-        """Raise `NotReady` where no capture could begin, but for one that runs."""
+        """Raise `NotReady` if no capture could start; a running one does not count."""
         problems = self.watching.problems()
         if not self._has_stage:
             problems.insert(0, "the service has not started")

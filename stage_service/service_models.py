@@ -1,4 +1,4 @@
-"""What goes into the service and comes out of it, as JSON."""
+"""The service's requests and responses, as JSON."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class _Wanted(Strict):
 
 
 class CaptureRequest(_Wanted):
-    """A capture to make, and the job that follows it by itself when it completes.
+    """A capture to start, and the pipeline that follows its completion.
 
     `head` is an OBJ file and `masks` a folder of `<camera>.png`, both on the service's machine;
-    `upload` names a subject whose head and masks were uploaded instead. `armed_by` says who at the
-    stage answers for flashes that the plan has consent for.
+    `upload` names a subject whose head and masks were uploaded instead. `armed_by` names the person
+    at the stage who arms the flashes that the plan has consent for.
     """
 
     model_config = with_example(
@@ -63,9 +63,9 @@ class CaptureRequest(_Wanted):
 
 
 class QueueRequest(_Wanted):
-    """A capture that is to wait for the stage, at the end of the queue or at `place` from 0.
+    """A capture to queue, at the end or at `place` from 0.
 
-    A plan that flashes needs its consent here; who answers for it is said when it is started.
+    A plan that flashes needs its consent here, and arming when it is started.
     """
 
     model_config = with_example(
@@ -76,8 +76,7 @@ class QueueRequest(_Wanted):
 
 
 class SnapshotRequest(Strict):
-    """One exposure to look at: in a light of this name, or in all; seconds and level, the rig
-    file's where they are not given."""
+    """A single exposure in one light, or in all; seconds and level default to the rig file's."""
 
     light: Annotated[str, Field(max_length=LONGEST_NAME)] | None = None
     exposure: Exposure | None = None
@@ -96,7 +95,7 @@ class BoardSize(Strict):
 
 
 class BoardQuery(BoardSize):
-    """The board, and whether the lenses are those that were calibrated or those of the capture."""
+    """The board, and whether to use the calibrated lenses instead of the capture's."""
 
     calibrated: bool = False
 
@@ -109,8 +108,8 @@ RadiusMm = Annotated[float, Field(gt=0, le=1000)]
 
 
 class CalibrationRequest(Strict):
-    """Captures to calibrate the rig by: of a board, one a pose, and of spheres, one a place. What
-    stood there is as for `hairstage calibrate rig`."""
+    """Captures to calibrate the rig from: one per pose of the board, one per position of a sphere;
+    options as of `hairstage calibrate rig`."""
 
     model_config = with_example(boards=["20261121-093000-1f2e", "20261121-093110-a0c4"])
 
@@ -126,7 +125,7 @@ class CalibrationRequest(Strict):
 
 
 class GoOnRequest(Strict):
-    """`hold`: the id of the queue's hold that the caller has read; it changes with each reason."""
+    """`hold`: the id of the queue's hold that the caller has read; each reason makes a new id."""
 
     model_config = with_example(hold="3f9ac2d1")
 
@@ -134,13 +133,13 @@ class GoOnRequest(Strict):
 
 
 class MoveRequest(Strict):
-    """Where in the queue, from 0."""
+    """A place in the queue, from 0."""
 
     place: Place
 
 
 class ResumeRequest(Strict):
-    """`armed_by`: who answers at the stage for flashes that the plan has consent for."""
+    """`armed_by`: the person at the stage who arms the flashes that the plan has consent for."""
 
     armed_by: PersonName | None = None
 
@@ -156,27 +155,27 @@ class JobRequest(Strict):
 
 
 class LeaseRequest(Strict):
-    """Who wants to steer alone, and for how long."""
+    """The holder of a lease, and its duration."""
 
     holder: PersonName
     seconds: LeaseSeconds = 60.0
 
 
 class RenewRequest(Strict):
-    """How long the lease is to last from now."""
+    """The lease's duration from now."""
 
     seconds: LeaseSeconds = 60.0
 
 
 class AcknowledgeRequest(Strict):
-    """Who looked at the stage, and what they saw."""
+    """The person who looked at the stage, and what they saw."""
 
     name: Annotated[str, Text, Field(min_length=2, max_length=100), ONE_LINE]
     note: Annotated[str, Text, Field(min_length=4, max_length=2000), LINES]
 
 
 class CaptureView(CaptureStatus):
-    """A capture's status and the job that its completion enqueued."""
+    """A capture's status and its job."""
 
     model_config = with_example(
         id="20261121-093000-1f2e",
@@ -201,11 +200,11 @@ class CaptureView(CaptureStatus):
 
 
 class QueueView(BaseModel):
-    """What waits for the stage, the next one first.
+    """The queued captures, the next one first.
 
-    `held`: why nothing begins by itself until a person who has read it says that it may, by `POST
-    /queue:go-on` with the id of `hold`, which has the same reasons one by one, the newest first.
-    `waits_for`: what the first one waits for now.
+    `held`: why the queue starts nothing until a person who has read it releases it, by `POST
+    /queue:go-on` with the id of `hold`, which has the reasons one by one, the newest first.
+    `waits_for`: what the first entry waits for.
     """
 
     held: str | None
@@ -215,14 +214,14 @@ class QueueView(BaseModel):
 
 
 class LeaseView(BaseModel):
-    """Who holds the lease, and until when (UTC); None: nobody, so anybody may steer."""
+    """The lease's holder and its end (UTC); None: no lease, every caller may steer."""
 
     holder: str | None
     expires: str | None
 
 
 class LeaseGrant(LeaseView):
-    """A lease and the token that steers under it, to be sent as the header `Hairstage-Lease`."""
+    """A lease and its token, to be sent as the header `Hairstage-Lease`."""
 
     token: str
 
@@ -235,8 +234,8 @@ class Artifact(BaseModel):
 
 
 class LatchView(BaseModel):
-    """Nothing is lit since `since`, because of `detail`; "blackout" ends it where the link can
-    tell that the lamps are off, else only a person's word: "acknowledge"."""
+    """Light is refused since `since`, because of `detail`. A "blackout" ends it if the link reads
+    back that the lamps are off, otherwise a person's "acknowledge"."""
 
     since: str
     detail: str
@@ -244,7 +243,7 @@ class LatchView(BaseModel):
 
     @classmethod
     def of(cls, latched: Latched | None) -> Self | None:
-        """That of a latch; None where nothing is latched."""
+        """The view of a latch; None without one."""
         if latched is None:
             return None
         way_out: Literal["blackout", "acknowledge"]
@@ -253,16 +252,14 @@ class LatchView(BaseModel):
 
 
 class Health(BaseModel):
-    """How the service is, as far as it knows without asking a device or the job database.
+    """The service's health, without a query of devices or the job database.
 
-    `status`: "unsafe" while `latch` is there: a blackout has failed, and nothing may be lit until
-    that is over; "degraded" where something else is wrong; `problems` has a sentence for each. What
-    is known of the lamps now is `lamps`: "dark", "said to be dark" (by somebody who looked), "in
-    use" or "unknown, unsafe", `lamps_detail` how that is known. Beside "ok" they are unknown before
-    the first blackout, during one, and after each of a bank that is accepted without read-back:
-    the last is `lamps_accepted`, off was sent and no blackout can tell more.
-    `worker`: whether one runs; `unread`: captures on the disk that are not listed yet;
-    `disk_free_bytes` is the root folder's, None where the disk does not answer.
+    `status`: "unsafe" while `latch` is set: a blackout has failed, and light is refused; "degraded"
+    for other problems; `problems` has a sentence for each. `lamps` is "dark", "said to be dark" (by
+    a person who looked), "in use" or "unknown, unsafe", with `lamps_detail`. With "ok" they are
+    unknown before the first blackout, during one, and after each of a bank without read-back that
+    the rig file accepts (`lamps_accepted`). `worker`: one is alive; `unread`: captures on the disk
+    that are not listed yet; `disk_free_bytes` is the root folder's, None while the disk hangs.
     """
 
     status: Literal["ok", "degraded", "unsafe"]
@@ -281,8 +278,8 @@ class Health(BaseModel):
 
 
 class StepView(BaseModel):
-    """A commanded exposure; `light` for "olat", `projector` and `row` for "scanline". `lacks`:
-    the cameras that have no frame of it, or not yet."""
+    """A commanded exposure; `light` for "olat", `projector` and `row` for "scanline". `lacks`: the
+    cameras without a frame of it."""
 
     index: int
     kind: StepKind
@@ -298,14 +295,14 @@ Vector = tuple[float, float, float]
 
 
 class Standing(BaseModel):
-    """Where something stands: metres, z up, the head's centre at the origin, its face to −y."""
+    """A device's position: metres, z up, the head's centre at the origin, its face to −y."""
 
     name: str
     position: Vector
 
 
 class Looking(Standing):
-    """A camera or a projector: the unit vector that it looks along, and how many pixels it has."""
+    """A camera or a projector: the unit vector of its optical axis, and its size in pixels."""
 
     towards: Vector
     width: int
@@ -313,10 +310,9 @@ class Looking(Standing):
 
 
 class RigView(BaseModel):
-    """The rig: where its lights, cameras and projectors stand, and what a plan gets where it does
-    not say otherwise. `living_subject`: flashes of 3 to 30 Hz need consent. `watchdog_s`: so many
-    seconds after the service's last heartbeat the light bank puts its lamps off by itself; None:
-    it has no watchdog."""
+    """The poses of lights, cameras and projectors, and the defaults of plans. `living_subject`:
+    flashes of 3 to 30 Hz need consent. `watchdog_s`: seconds after the service's last heartbeat
+    until the light bank puts its lamps off by itself; None: it has no watchdog."""
 
     name: str
     lights: list[Standing]
@@ -329,7 +325,7 @@ class RigView(BaseModel):
 
     @classmethod
     def of(cls, rig_file: RigFile) -> Self:
-        """That of a rig file."""
+        """The view of a rig file."""
         rig, devices = rig_file.rig, rig_file.devices
         return cls(
             name=rig.name,

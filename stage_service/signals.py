@@ -1,4 +1,4 @@
-"""Signals: waiting for one without missing it, and having one sent when somebody dies."""
+"""Signals: wait for one without missing it, and send one when the parent dies."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 
 
 def taken(*numbers: signal.Signals) -> Callable[[], None]:
-    """Take these signals over, for the main thread; what is returned waits for the first.
+    """Handle these signals in the main thread; returns a function that waits for the first.
 
-    The signals come through a pipe. An `Event` that a handler sets can be slept through: Python
-    runs handlers between bytecodes, so a signal just before the wait is seen only after it.
+    They arrive through a pipe. An `Event` set by a handler could be missed: Python runs handlers
+    between bytecodes, so a signal right before the wait would be handled after it.
     """
     read, write = os.pipe()
     os.set_blocking(write, False)
@@ -30,9 +30,9 @@ def taken(*numbers: signal.Signals) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def held(*numbers: signal.Signals) -> Iterator[None]:
-    """Hold these signals back in the main thread until the end of the with-block.
+    """Defer these signals in the main thread until the end of the with-block.
 
-    Unlike a blocked signal, one that is held is not held for the processes started meanwhile.
+    Unlike blocked signals, they are not deferred in processes started meanwhile.
     """
     came: list[int] = []
     before = {number: signal.getsignal(number) for number in numbers}
@@ -48,9 +48,10 @@ def held(*numbers: signal.Signals) -> Iterator[None]:
 
 
 def tied(command: list[str], how: str = "TERM") -> list[str]:
-    """`command`, to get the signal `how` when the thread that starts it is gone, even by SIGKILL.
+    """`command`, wrapped to get the signal `how` when the thread that starts it ends, even by
+    SIGKILL.
 
-    By util-linux's `setpriv`, which becomes the command; where that is missing, as it is.
+    Uses util-linux's `setpriv`; without it the command is unchanged.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", how, "--", *command] if setpriv else command

@@ -1,7 +1,7 @@
-"""The end of a process: steps beside each other, each with its own time, and a limit for the whole.
+"""The end of a process: parallel steps, each with a time limit, and a limit for the whole.
 
-What a process waits for may hang for ever: a job database that was frozen, a disk that is gone, a
-device, native code. None of these may keep it from ending.
+A job database, a disk, a device or native code may hang; none of these may keep a process from
+ending.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from stage_service.background import beside
 
 log = logging.getLogger("hairstage.stop")
 STOP_S = 10.0
-"""Seconds from the signal to the end of the process, whatever hangs; `TimeoutStopSec` of the units
-in `deploy/systemd`, and `stop_grace_period` of the containers, are longer."""
+"""Longest time from the signal to the end of the process, in seconds; `TimeoutStopSec` of the units
+in `deploy/systemd` and `stop_grace_period` of the containers are longer."""
 LAST_S = 2.0
-"""So much earlier a process that hangs says what it leaves and ends by itself; should even that
-hang, the kernel ends it (SIGALRM)."""
+"""Seconds before that at which a process that hangs logs what is unfinished and exits; if that
+hangs, too, the kernel ends it (SIGALRM)."""
 LEFT = 1
-"""Exit status of a process that has left something unfinished."""
+"""Exit status of a process with unfinished steps."""
 
 
 class NotEnded(RuntimeError):
-    """What was to end goes on, and is not waited for any longer."""
+    """A step has not ended in time."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """Something to end, named as the log has it, within `within_s` seconds; `NotEnded` says why it
-    could not be ended."""
+    """A step that has to end within `within_s` seconds; its `work` may raise `NotEnded`."""
 
     name: str
     work: Callable[[], object]
@@ -44,8 +43,8 @@ class Step:
 
 
 def end_all(steps: Iterable[Step], left: list[str]) -> None:
-    """Begin every step, in this order, and wait for each as long as it has from now. `left` has the
-    names of those that have not ended yet, or failed; the log says why, and the others go on."""
+    """Start every step, in this order, and wait for each until its limit. `left` has the names of
+    those that have not ended or failed, which are logged."""
     began, under_way = time.monotonic(), []
     for step in steps:
         left.append(step.name)
@@ -69,10 +68,10 @@ def _ended(left: list[str], name: str, over: Future[object]) -> None:
 
 
 class Ending:
-    """Ends this process at most `STOP_S` seconds after this is made, or when `by` said so.
+    """Ends this process at most `STOP_S` seconds after construction, or earlier by `by`.
 
-    `left` has the names of what has not ended yet: with any of them the exit status is `LEFT`.
-    `doing()` says what else is under way, for the log.
+    `left` has the names of unfinished steps: with any of them the exit status is `LEFT`. `doing()`
+    returns other work under way, for the log.
     """
 
     def __init__(self, left: list[str], doing: Callable[[], str] = str) -> None:
@@ -84,13 +83,13 @@ class Ending:
         threading.Thread(target=self._watch, name="end of the process", daemon=True).start()
 
     def by(self, seconds: float) -> None:
-        """End it so many seconds from now, or earlier where that was to be so."""
+        """End it at most `seconds` from now."""
         with self._sooner:
             self._at = min(self._at, time.monotonic() + seconds)
             self._sooner.notify_all()
 
     def now(self) -> None:
-        """End it, with a line in the log where anything is left."""
+        """End it, and log unfinished steps."""
         doing = self._doing()
         if self.left or doing:
             what = "; ".join([*self.left, *([doing] if doing else [])])

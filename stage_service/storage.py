@@ -1,7 +1,7 @@
-"""What lies under the root folder: removed into a trash, verified again, uploaded, archived.
+"""Captures, models and uploads under the root folder, and their removal into `trash/`.
 
-Nothing is removed that is being shot, written or used by a job. What is removed goes into
-`trash/` and comes back from there until it is emptied, by an admin.
+Captures that are being shot or written, and what a job uses, cannot be removed. Removed ones can be
+restored until an admin empties the trash.
 """
 
 from __future__ import annotations
@@ -31,34 +31,34 @@ from stage_service.links import check_link, check_links, outward, remove, target
 from stage_service.trash import Kind, Removed, Trash
 
 KEPT_DAYS = 30.0
-"""How long what was removed is kept, where nobody asks for less."""
+"""Default age in days after which the trash may be emptied."""
 PAGE_OF_JOBS = 1000
 
 
 class InUse(RuntimeError):
-    """A job, or what is to follow a capture, still needs what was to be removed."""
+    """A job, running or pending, needs it."""
 
 
 class NotThere(LookupError):
-    """There is no such model, upload, or thing in the trash."""
+    """There is no such model, upload, or entry of the trash."""
 
 
 class BadUpload(ValueError):
-    """What was sent is not what its place says."""
+    """The uploaded file is invalid."""
 
 
 class NotRemoved(RuntimeError):
-    """Some of what was to be deleted is still in the trash: `problems` names each, and why."""
+    """Some entries of the trash could not be deleted: `problems` has each with its reason."""
 
     def __init__(self, deleted: int, problems: list[str]) -> None:
-        told = f"{deleted} entries of the trash were deleted, {len(problems)} could not be"
-        super().__init__(f"{told}: {problems[0]}")
+        summary = f"{deleted} entries of the trash were deleted, {len(problems)} could not be"
+        super().__init__(f"{summary}: {problems[0]}")
         self.problems = problems
 
 
 class Folder(BaseModel):
-    """A folder by its name: its files, and their bytes. `link` is where it leads, if it is a link,
-    of which nothing is read; `outside` its links that lead out of it, which are not read either."""
+    """A folder: its files and their total bytes. `link` is its target if it is a link, `outside`
+    its links that lead out of it; neither is read."""
 
     name: str
     files: list[str]
@@ -70,8 +70,7 @@ class Folder(BaseModel):
 class Storage:
     """Captures, models, uploads and the trash of one root.
 
-    A capture that completed, and a model, is removed by an admin alone; what did not complete by
-    whoever may steer.
+    Removing a completed capture or a model needs the scope "admin", an incomplete one "steer".
     """
 
     def __init__(
@@ -86,7 +85,7 @@ class Storage:
         self._decoder = decoder
         self._trash, self._uploads = Trash(root / "trash"), root / "uploads"
         self._uploading = threading.Lock()  # a file has one temporary name
-        self._emptying = threading.Lock()  # what is being deleted must not be restored
+        self._emptying = threading.Lock()  # no restore during a deletion
 
     def models(self) -> list[Folder]:
         """The models, by name."""
@@ -99,7 +98,7 @@ class Storage:
         return Model(path)
 
     def whole_model(self, name: str) -> Model:
-        """The same, where no link in it leads out of it either."""
+        """As `model`; raises `LeadsOutside` also for a link in it that leads out of it."""
         model = self.model(name)
         check_links(f"the model {name}", model.path)
         return model
@@ -119,11 +118,11 @@ class Storage:
         status = self._captures.get(capture)
         by.require("admin" if status.outcome == "completed" else "steer")
         path = Path(status.path)
-        whole = path if path.is_symlink() else path.resolve()  # a link's jobs are another's
+        whole = path if path.is_symlink() else path.resolve()  # a link has no jobs of its own
         made = [j for j in self._all_jobs() if Path(j.capture) == whole]
         busy = next((j.id for j in made if j.state != "done"), None)
         if busy is not None or pending(capture):
-            raise InUse(f"capture {capture}: job {busy or 'to follow'} needs it: wait, or cancel")
+            raise InUse(f"capture {capture}: {busy or 'a pending job'} needs it: wait, or cancel")
         models = sorted({Path(j.model).name for j in made if Path(j.model).is_dir()})
         found = self._removal("capture", capture, path, by).model_copy(update={"models": models})
         self._captures.check_idle(capture)
@@ -137,31 +136,31 @@ class Storage:
 
         work = partial(self._captures.set_aside, capture, move)
         removed = self._control.do(by, "capture.remove", work, capture)
-        self._tell("removed", removed)
+        self._publish("removed", removed)
         return removed
 
     def remove_model(self, name: str, by: Caller, *, dry_run: bool) -> Removed:
-        """Put a model into the trash. Raises `NotThere`, `InUse`, `Forbidden`,
+        """Move a model into the trash. Raises `NotThere`, `InUse`, `Forbidden`,
         `JobsUnavailable`."""
         by.require("admin")
         model = Model(self._model_place(name))
         busy = self._jobs.at_work_on(model)
         if busy is not None:
-            raise InUse(f"model {name}: job {busy} makes it: wait, or cancel it")
+            raise InUse(f"model {name}: job {busy} writes it: wait, or cancel it")
         found = self._removal("model", name, model.path, by)
         if dry_run:
             return found
         work = partial(self._trash.put, found, model.path)
         removed = self._control.do(by, "model.remove", work, name, steers=False)
-        self._tell("removed", removed)
+        self._publish("removed", removed)
         return removed
 
     def trash(self) -> list[Removed]:
-        """What was removed, oldest first."""
+        """The entries of the trash, oldest first."""
         return [found for _, found in self._trash.entries()]
 
     def restore(self, name: str, by: Caller) -> Removed:
-        """Put something back. Raises `NotThere`, `InUse` where its place is taken, `Forbidden`."""
+        """Restore an entry. Raises `NotThere`, `InUse` where its name is taken, `Forbidden`."""
         by.require("admin")
         with self._emptying:
             entries = self._trash.entries()
@@ -176,19 +175,19 @@ class Storage:
         def work() -> Removed:
             to = self._root / f"{found.kind}s" / found.id
             if os.path.lexists(to):
-                raise InUse(f"{found.kind} {found.id} is there again: remove that one first")
+                raise InUse(f"{found.kind} {found.id} exists: remove that one first")
             self._trash.take_out(place, found, to)
             if found.kind == "capture":
                 self._captures.catalogue.adopt(found.id)
             return found
 
         restored = self._control.do(by, f"{found.kind}.restore", work, found.id, steers=False)
-        self._tell("restored", restored)
+        self._publish("restored", restored)
         return restored
 
     def empty(self, older_than_days: float, by: Caller, *, dry_run: bool) -> list[Removed]:
-        """Delete for good what was removed so many days ago; returns what was. Raises `Forbidden`,
-        and `NotRemoved` where some of it cannot be deleted, after all else was."""
+        """Delete entries that are older than `older_than_days`; returns them. Raises `Forbidden`,
+        and `NotRemoved` if some could not be deleted, after the others were."""
         by.require("admin")
         before = (datetime.now(UTC) - timedelta(days=older_than_days)).isoformat()
         with self._emptying:
@@ -211,11 +210,11 @@ class Storage:
         return deleted
 
     def uploads(self) -> list[Folder]:
-        """What was uploaded, by subject."""
+        """The uploads, by subject."""
         return _folders(self._uploads)
 
     def upload_head(self, subject: str, data: bytes, by: Caller) -> Folder:
-        """Keep a digitised head (OBJ). Raises `BadUpload`, `DecoderBusy`, `DiskFull`."""
+        """Store a digitised head (OBJ). Raises `BadUpload`, `DecoderBusy`, `DiskFull`."""
         try:
             self._decoder.head(data, "head.obj")
         except Undecodable as error:
@@ -223,7 +222,7 @@ class Storage:
         return self._upload(subject, "head.obj", data, by)
 
     def upload_mask(self, subject: str, camera: str, data: bytes, rig: Rig, by: Caller) -> Folder:
-        """Keep a hair mask (PNG, as large as the camera's frames). Raises `BadUpload`,
+        """Store a hair mask (PNG of the camera's size). Raises `BadUpload`,
         `DecoderBusy`, `DiskFull`."""
         known = {c.name: c for c in rig.cameras}
         if camera not in known:
@@ -236,7 +235,7 @@ class Storage:
         return self._upload(subject, name, data, by)
 
     def uploaded(self, subject: str) -> tuple[Path | None, Path | None]:
-        """Head and folder of masks of a subject, where there are any. Raises `NotThere`,
+        """A subject's head and folder of masks, None where missing. Raises `NotThere`,
         `LeadsOutside`."""
         folder = self._upload_place(subject)
         check_links(f"the upload {subject}", folder)
@@ -244,7 +243,7 @@ class Storage:
         return head if head.is_file() else None, masks if masks.is_dir() else None
 
     def remove_upload(self, subject: str, by: Caller) -> Folder:
-        """Delete what was uploaded; captures have copies of their own. Raises `NotThere`."""
+        """Delete an upload; captures have copies of their own. Raises `NotThere`."""
         with self._uploading:
             folder = self._upload_place(subject)
             found, work = _listed(folder), partial(remove, folder)
@@ -254,7 +253,7 @@ class Storage:
     def _upload_place(self, subject: str) -> Path:
         folder = self._uploads / subject
         if not is_file_name(subject) or not (folder.is_dir() or folder.is_symlink()):
-            raise NotThere(f"no subject was uploaded as {subject!r}")
+            raise NotThere(f"there is no upload {subject!r}")
         return folder
 
     def _upload(self, subject: str, name: str, data: bytes, by: Caller) -> Folder:
@@ -284,7 +283,7 @@ class Storage:
             link=listed.link,
         )
 
-    def _tell(self, what: str, found: Removed) -> None:
+    def _publish(self, what: str, found: Removed) -> None:
         self._captures.events.publish(f"{found.kind}.{what}", {"id": found.id})
 
     def _all_jobs(self) -> Iterator[Job]:
@@ -296,8 +295,8 @@ class Storage:
 
 @contextmanager
 def _no_writer(capture: Path) -> Iterator[None]:
-    """Hold the journal's lock, where there is a journal. Raises `JournalInUse`."""
-    if capture.is_symlink():  # its journal is another's
+    """Hold the journal's lock, if there is a journal. Raises `JournalInUse`."""
+    if capture.is_symlink():  # its journal is outside
         yield
         return
     try:
@@ -314,18 +313,16 @@ def _no_writer(capture: Path) -> Iterator[None]:
 
 
 def files_of(what: str, folder: Path) -> dict[str, Path]:
-    """The whole files that lie under a folder, called `what`, by their relative names, in order.
-    Raises `CaptureError` where it has gone, `LeadsOutside` where some of it lies elsewhere."""
+    """The complete files of a folder, named `what` in errors, by their relative names. Raises
+    `CaptureError` if it is gone, `LeadsOutside` for links out of it."""
     check_links(what, folder)
     if not folder.is_dir():
-        raise CaptureError(
-            f"{folder}: {what} is not there any more: its folder was moved or removed"
-        )
+        raise CaptureError(f"{folder}: {what} is gone: its folder was moved or removed")
     return Model(folder).artifacts()
 
 
 def _folders(folder: Path) -> list[Folder]:
-    """The folders in one, and the links, wherever they lead, by name."""
+    """The folders and links in a folder, by name."""
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     return [_listed(p) for p in found if (p.is_dir() or p.is_symlink()) and is_file_name(p.name)]
 

@@ -1,4 +1,4 @@
-"""Jobs as the seam has them: what is asked of the queue, in callers' names, and what it leaves."""
+"""Jobs in callers' names: submit, read, cancel, and their artifacts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class UnknownArtifact(LookupError):
 
 
 class NotFinished(RuntimeError):
-    """What was asked for needs a capture that completed."""
+    """The capture has not completed."""
 
 
 class KeyUsed(RuntimeError):
@@ -33,19 +33,19 @@ class KeyUsed(RuntimeError):
 
     def __init__(self, job: Job) -> None:
         super().__init__(
-            f"your Idempotency-Key stands for {job.pipeline} on capture {Path(job.capture).name} "
-            f"(job {job.id}), and this request differs from it: send another key"
+            f"your Idempotency-Key was used for {job.pipeline} on capture {Path(job.capture).name} "
+            f"(job {job.id}), and this request differs: send another key"
         )
 
 
 class ModelInUse(RuntimeError):
-    """Another job, queued or running, makes the same model."""
+    """Another job, queued or running, writes the same model."""
 
 
 class Submitting:
-    """Takes jobs for the models under `models`; `capture_path` finds a capture's folder.
+    """Submits jobs for the models under `models`; `capture_path(id)` is a capture's folder.
 
-    Whoever holds `lock` keeps new jobs from being submitted.
+    While `lock` is held no job is submitted.
     """
 
     def __init__(
@@ -61,10 +61,9 @@ class Submitting:
         self.lock = threading.Lock()
 
     def submit(self, request: JobRequest, by: Caller, key: str | None = None) -> Job:
-        """Enqueue a pipeline on a capture; where the caller did that under this `key`, it is that
-        job. A key is its caller's, by the name of their token: another's is another key. Raises
-        `UnknownCapture`, `NotFinished`, `BadInput`, `ModelInUse`, `JobsUnavailable`; `KeyUsed`
-        where the key stands for another request."""
+        """Enqueue a pipeline on a capture. A repeated `key` of the same caller, by their token's
+        name, returns the first job. Raises `UnknownCapture`, `NotFinished`, `BadInput`,
+        `ModelInUse`, `JobsUnavailable`; `KeyUsed` if the key was used for another request."""
         job = new_job_id()
         if key is not None:
             own = sha256("\0".join((by.name, key)).encode())  # NUL is in neither
@@ -77,7 +76,7 @@ class Submitting:
         return made if key is None else self._same(made, request)
 
     def _same(self, job: Job, request: JobRequest) -> Job:
-        """The job, where it is what the request asks for. Raises `KeyUsed`."""
+        """The job, if it is the request's. Raises `KeyUsed`."""
         pipeline, wanted = request.pipeline, self._models / (request.model or job.id)
         timeout_s = pipeline.timeout_s
         theirs = (pipeline.name, pipeline.options.to_dict(), pipeline.priority, pipeline.retries)
@@ -97,10 +96,10 @@ class Submitting:
         path = self._capture_path(request.capture)
         capture = Capture(path)
         if capture.manifest is None:
-            raise NotFinished(f"capture {request.capture} has no manifest yet: it is not finished")
+            raise NotFinished(f"capture {request.capture} is not finished: wait for it")
         if (outcome := capture.manifest.get("outcome")) != "completed":
             raise NotFinished(
-                f"capture {request.capture} is {outcome}, not completed: resume it, or shoot anew"
+                f"capture {request.capture} is {outcome}, not completed: resume it, or shoot again"
             )
         check_named(request.pipeline, capture.rig)
         model = Model(self._models / (request.model or job))
@@ -108,14 +107,14 @@ class Submitting:
         rebuilds = "reconstruct" in PIPELINES[request.pipeline.name]
         if not rebuilds and not model.has("strands.npz"):
             raise BadInput(
-                f"model: {request.pipeline.name!r} needs a model with strands: name one that "
-                "'reconstruct' made"
+                f"model: {request.pipeline.name!r} needs a model with strands, as made by "
+                "'reconstruct'"
             )
         with self.lock:
             other = self._queue.at_work_on(model)
-            if other not in (None, job):  # itself: of the same key, enqueued a moment ago
+            if other not in (None, job):  # itself: enqueued by the same key
                 raise ModelInUse(
-                    f"model {model.path.name}: job {other} makes it; wait, or cancel it"
+                    f"model {model.path.name}: job {other} writes it: wait, or cancel it"
                 )
             return self._queue.submit(request.pipeline, path, model, job=job)
 
@@ -124,18 +123,17 @@ class Submitting:
         return self._queue.all(limit=limit, offset=offset)
 
     def get(self, job_id: str) -> Job:
-        """A job's present state. Raises `NoSuchJob`, as all about jobs `JobsUnavailable`."""
+        """A job's present state. Raises `NoSuchJob`, `JobsUnavailable`."""
         try:
             return self._queue.get(job_id)
-        except NoSuchJob:  # that of a capture which has just completed may not be there yet
-            # Not owed (any more): it was enqueued meanwhile, or there is none.
+        except NoSuchJob:  # the job of a capture that has just completed may be pending
             return self._follower.enqueue_now(job_id) or self._queue.get(job_id)
 
     def cancel(self, job_id: str, by: Caller) -> Job:
         """Cancel a job: a queued one at once, a running one at its next progress call."""
 
         def work() -> Job:
-            return self._queue.cancel(self.get(job_id).id)  # one that is owed is there from now on
+            return self._queue.cancel(self.get(job_id).id)  # `get` enqueues a pending one
 
         return self._control.do(by, "job.cancel", work, job_id, steers=False)
 

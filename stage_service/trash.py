@@ -1,6 +1,6 @@
-"""The trash of one root: what was removed, each in a folder of its own with a record of it.
+"""The trash of one root: each entry in a folder of its own with a record.
 
-Every entry is listed, whatever a crash has left of it, so that all can be deleted.
+Entries that a crash has damaged are listed, too, so that they can be deleted.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from stage_service.links import remove, target_of
 
 Kind = Literal["capture", "model", "unknown"]
 RECORD, DELETING = "removed.json", ".deleting"
-"""The files of an entry: its record, and what is left of a thing while it is being deleted."""
+"""Names in an entry: its record, and the content during a deletion."""
 
 
 class Removed(BaseModel):
-    """Something in the trash, or (`name` is None) what would go there: "capture" or "model" `id`,
-    by whom and when (UTC), its bytes, and the models that were made of a capture and stay.
+    """An entry of the trash, or (`name` None) one to be: "capture" or "model" `id`, removed by whom
+    and when (UTC), its bytes, and the `models` made from a capture, which stay.
 
-    `link` is where it leads, if it is a link; `problem` why it cannot be restored, as after a
-    crash: it can be deleted all the same. The kind is "unknown" where its record cannot be read.
+    `link` is its target if it is a link; `problem` why it can only be deleted, as after a crash.
+    The kind is "unknown" if its record is unreadable.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -46,13 +46,13 @@ class Removed(BaseModel):
 
 
 class Trash:
-    """What was removed, in `folder`. Not locked: the owner is."""
+    """The trash in `folder`. The owner locks it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def entries(self) -> list[tuple[Path, Removed]]:
-        """Each entry's place and what it is, oldest first."""
+        """Each entry's folder and record, oldest first."""
         places = sorted(self._folder.iterdir()) if self._folder.is_dir() else []
         return sorted(((p, _entry(p)) for p in places), key=lambda e: e[1].removed)
 
@@ -72,16 +72,16 @@ class Trash:
         return found.model_copy(update={"name": name})
 
     def take_out(self, place: Path, found: Removed, to: Path) -> None:
-        """Move it to where it is to be."""
+        """Restore an entry to `to`."""
         (place / found.id).rename(to)
         flush(to.parent)
         remove(place)
 
     def delete(self, place: Path, found: Removed) -> None:
-        """Delete it for good; what is left of it after a crash cannot be restored. `OSError`."""
+        """Delete an entry. Raises `OSError`."""
         if found.problem is None:
             (place / found.id).rename(place / DELETING)
-            remove(place / DELETING)  # first: the record stays until all has gone
+            remove(place / DELETING)  # before the record
         remove(place)
 
 
@@ -90,12 +90,12 @@ def _entry(place: Path) -> Removed:
     name, link = printable(place.name), target_of(place)
     unknown = Removed(name=name, kind="unknown", id=name, by="", removed=removed, bytes=0)
     if link is not None or not place.is_dir():
-        problem = "it is no folder that this service has put here"
+        problem = "it was not put here by the service"
         return unknown.model_copy(update={"link": link, "problem": problem})
     try:
         found = Removed.model_validate(read_json(inside(place, RECORD)))
         if not is_file_name(found.id) or found.id == RECORD:
-            raise ValueError(f"{RECORD}: {found.id!r} is no name of a capture or model")
+            raise ValueError(f"{RECORD}: {found.id!r} is not a name of a capture or model")
     except (OSError, ValueError) as error:
         problem = f"its record cannot be read: {printable(str(error))}"
         return unknown.model_copy(update={"problem": problem})

@@ -1,4 +1,4 @@
-"""Which names of a rig file its wires can carry; `docs/wire.md` has the wires."""
+"""Names of a rig file that its wires can carry; see `docs/reference/wire.md`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 LONGEST_PROJECTOR_NAME = 32
-"""Characters: the longest request with a name, ENTRY, then stays within a line of 96."""
+"""Characters, so that the longest request, ENTRY, fits into 96."""
 _PROJECTOR = re.compile(rf"[A-Za-z0-9._-]{{1,{LONGEST_PROJECTOR_NAME}}}")
 _SERIAL_NUMBER = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _CHARACTERS = "the letters A to Z and a to z, digits, '.', '_' and '-'"
 
 
 def unfit_projectors(names: Sequence[str]) -> Iterator[str]:
-    """A sentence for each name that the projector controller's lines cannot carry: they part words
-    by blanks and names by commas, in ASCII."""
+    """A sentence for each name that the projector controller's ASCII lines cannot carry."""
     allowed = f"1 to {LONGEST_PROJECTOR_NAME} characters of {_CHARACTERS}"
     for number, name in enumerate(names, 1):
         if not _PROJECTOR.fullmatch(name):
@@ -23,8 +22,8 @@ def unfit_projectors(names: Sequence[str]) -> Iterator[str]:
 
 
 def unfit_serials(serials: Mapping[str, str], cameras: Sequence[str]) -> Iterator[str]:
-    """A sentence for each camera without a serial number, and each serial number that is of no
-    camera, or is none."""
+    """A sentence for each camera without a serial number, and each serial number without a camera
+    or with invalid characters."""
     place = "devices.cameras.serials"
     for camera in cameras:
         if camera not in serials:

@@ -22,7 +22,7 @@ def get_board(
 ) -> BoardView:
     """What a camera's lit frame shows of the board, and how far each corner is from where the lens
     has it."""
-    return service.board(capture, camera, board)
+    return service.frames.board(capture, camera, board)
 
 
 @router.post("/calibration", status_code=status.HTTP_202_ACCEPTED)

@@ -83,7 +83,7 @@ def get_capture(capture: str, service: OnService) -> CaptureView:
 @reading.get("/captures/{capture}/steps", tags=["captures"])
 def get_steps(capture: str, service: OnService) -> list[StepView]:
     """What a capture shoots, in order: which step is which light."""
-    return service.steps(capture)
+    return service.frames.steps(capture)
 
 
 @router.post("/captures/{capture}/pause", tags=["captures"])
@@ -116,7 +116,7 @@ async def abort_capture(
 )
 def get_frame(capture: str, step: int, camera: str, service: OnService) -> Response:
     """A frame as it was written: scene-linear radiance, W/(sr m²)."""
-    file = service.frame(capture, step, camera, lambda path: path.open("rb"))
+    file = service.frames.read(capture, step, camera, lambda path: path.open("rb"))
     return opened_response(file, "image/x-exr", f"{capture}-{step}-{camera}.exr")
 
 
@@ -141,14 +141,14 @@ def get_preview(
     """A picture of a frame to look at: exposed by a percentile, or by what is said to be white, so
     that frames can be compared; sRGB, made smaller where `size` says so."""
     look = {"percentile": percentile, "white": white, "size": size, "mark": mark}
-    picture = service.preview(capture, step, camera, **look)
+    picture = service.frames.preview(capture, step, camera, **look)
     return Response(picture, media_type="image/png")
 
 
 @reading.get("/captures/{capture}/frames/{step}/{camera}.json", tags=["captures"])
 def get_figures(capture: str, step: int, camera: str, service: OnService) -> FrameFigures:
     """How a frame is exposed, and how sharp it is."""
-    return service.figures(capture, step, camera)
+    return service.frames.figures(capture, step, camera)
 
 
 @router.post("/jobs", status_code=status.HTTP_202_ACCEPTED, tags=["jobs"])

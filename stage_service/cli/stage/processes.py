@@ -57,11 +57,6 @@ def add(commands: Commands) -> None:
         "--name", action="append", default=[], help="a further host name of this service"
     )
     serve.add_argument(
-        "--verify-days",
-        type=float,
-        help="verify each capture against its checksums every so many days",
-    )
-    serve.add_argument(
         "--take-over", action="store_true", help="take the stage from a service that has died"
     )
     serve.add_argument(
@@ -123,9 +118,6 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             f"--host {args.host}: requests from other machines need tokens and TLS: "
             "leave out --no-auth, and give --tls-cert and --tls-key"
         )
-    if args.verify_days is not None and not 0 < args.verify_days <= 10_000:
-        expected = "days above 0 and at most 10,000"
-        raise BadArgument(f"--verify-days: expected {expected}, got {args.verify_days:g}")
     _check_certificate(args)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
@@ -134,7 +126,6 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             args.root,
             take_over=args.take_over,
             gpu_workers=args.gpu_workers,
-            verify_days=args.verify_days,
         )
         service.take_stage()
     except StageInUse as error:

@@ -250,11 +250,11 @@ def test_what_is_being_read_of_a_capture_that_goes_on_counts_for_nothing(http, m
     found = threading.Event()
     verifier = http.service._verifier
     monkeypatch.setattr(verifier, "_verify", lambda *_: found.wait(60) and ["of before"])
-    verifier.ask(capture["id"], Path(capture["path"]))
+    verifier.submit(capture["id"], Path(capture["path"]))
     until(lambda: verifier.get(capture["id"]).state == "running")
     verifier.forget(capture["id"])
     found.set()
-    verifier.ask("another", Path(capture["path"]))
+    verifier.submit("another", Path(capture["path"]))
     until(lambda: verifier.get("another").state == "done")
     assert verifier.damaged == ["another"]
 
@@ -262,20 +262,6 @@ def test_what_is_being_read_of_a_capture_that_goes_on_counts_for_nothing(http, m
 def _done(http: Client, path: str, after: str = "") -> Any:
     found = http.get(f"{path}/verification").json()
     return found if found["state"] == "done" and found["finished"] > after else None
-
-
-def test_damage_of_captures_that_are_gone_is_told_no_more(rig_file, tmp_path):
-    root = tmp_path / "root"
-    gone = {"capture": "20260101-000000-0000", "state": "done", "wrong": 1, "problems": ["it"]}
-    root.mkdir()
-    (root / "verified.json").write_text(json.dumps([gone]))
-    with serving(rig_file, root) as http:
-        assert http.get("/health").json()["status"] == "ok"
-        capture = shot(http)
-        verifier = http.service._verifier
-        verifier.ask(capture["id"], Path(capture["path"]).with_name("gone meanwhile"))
-        until(lambda: verifier.get(capture["id"]).state == "never")
-        assert http.get("/health").json()["status"] == "ok"
 
 
 def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monkeypatch):
@@ -334,28 +320,13 @@ class Told(subprocess.Popen):
 
 verification.subprocess.Popen = Told
 root = Path(sys.argv[1])
-one = verification.Verifier(root / "verified.json", EventLog(), lambda: True, list, None)
+one = verification.Verifier(EventLog(), lambda: True)
 one.start()
-one.ask("any", root)
+one.submit("any", root)
 time.sleep(600)
 """
     child = orphan(code, tmp_path)
     until(lambda: gone(child))
-
-
-def test_what_was_not_read_for_long_is_read_again_by_itself(rig_file, tmp_path):
-    root = tmp_path / "root"
-    with serving(rig_file, root) as http:
-        capture = shot(http)["id"]
-        verifier = http.service._verifier
-        assert verifier._overdue() == {}
-        verifier._days = 1.0
-        assert list(verifier._overdue()) == [capture]
-        http.post(f"/captures/{capture}/verify")
-        until(lambda: _done(http, f"/captures/{capture}"), pause=0.1)
-        assert verifier._overdue() == {}
-    with serving(rig_file, root) as http:  # it is kept
-        assert http.get(f"/captures/{capture}/verification").json()["state"] == "done"
 
 
 def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):

@@ -156,9 +156,6 @@ def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_
         (["--tls-cert", tmp_path / "none.pem"], "none.pem: no such file"),
         (["--tls-cert", junk, "--tls-key", junk], "not a certificate with its key"),
         (["--tls-key", junk], "--tls-key needs --tls-cert"),
-        (["--verify-days", "-1"], "above 0 and at most 10,000, got -1"),
-        (["--verify-days", "1e6"], "above 0 and at most 10,000, got 1e+06"),
-        (["--verify-days", "inf"], "above 0 and at most 10,000, got inf"),
     ):
         code, data = run(capsys, "serve", "--rig", "demo", "--root", root, *words)
         assert code == 3
