@@ -4,7 +4,7 @@ from stage_service import CapturePlan, load_rig_file, resolve
 
 resolve(CapturePlan(), load_rig_file("demo.toml")).cost
 
-The names of `__init__.pyi` are loaded when they are first asked for.
+The names of `__init__.pyi` are loaded on first use.
 """
 
 import lazy_loader

@@ -168,7 +168,7 @@ class RenewRequest(Strict):
 
 
 class AcknowledgeRequest(Strict):
-    """The person who looked at the stage, and what they saw."""
+    """The person who inspected the stage, and what they saw."""
 
     name: Annotated[str, Text, Field(min_length=2, max_length=100), ONE_LINE]
     note: Annotated[str, Text, Field(min_length=4, max_length=2000), LINES]

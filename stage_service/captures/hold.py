@@ -1,4 +1,4 @@
-"""Why the queue begins nothing by itself, until a person who has read it says that it may."""
+"""The hold of the queue, until a person who has read its reasons releases it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from reconstruction.reading import printable
 from stage_service.records.events import EventLog
 
 MOST_REASONS = 5
-"""Reasons that are kept, the newest: more than anybody reads before they press a button."""
+"""Reasons that are stored, the newest first."""
 STARTED = "the service started"
-"""How the reason of a start begins; of several starts in a row the last one is kept."""
+"""The first words of a start's reason; of consecutive starts the last one is stored."""
 
 
 class Reason(BaseModel):
-    """What happened, `at` which time (UTC)."""
+    """The reason of a hold, and its time `at` (UTC)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -35,7 +35,7 @@ class Reason(BaseModel):
 
 
 class Held(BaseModel):
-    """A hold: `reasons`, the newest first; the next reason makes a new `id`."""
+    """A hold: `reasons`, the newest first; each reason makes a new `id`."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -50,7 +50,7 @@ class Held(BaseModel):
 
 
 class HoldChanged(RuntimeError):
-    """The queue is held for another reason than the one that the caller has read."""
+    """The queue is held for a reason that the caller has not read."""
 
     def __init__(self, held: Held) -> None:
         super().__init__(
@@ -61,9 +61,9 @@ class HoldChanged(RuntimeError):
 
 
 class Hold:
-    """Holds from its making on, which is the service's start; waits for no disk.
+    """The queue's hold, set from construction, the service's start; waits for no disk.
 
-    `changed` is called after each change, by whoever made it.
+    `changed()` is called after each change.
     """
 
     def __init__(self, events: EventLog, why: str = STARTED) -> None:
@@ -74,29 +74,29 @@ class Hold:
 
     @property
     def current(self) -> Held | None:
-        """Why nothing begins; None where it may."""
+        """The present hold; None if the queue may start captures."""
         return self._held
 
     def recall(self, before: Sequence[Reason]) -> None:
-        """Put the reasons of the service before behind this one's."""
+        """Append the reasons stored by an earlier service."""
         known = [r for r in before if not r.why.startswith(STARTED)]
         with self._lock:
             if self._held is not None:
                 self._held = _held([*self._held.reasons, *known])
 
     def set(self, why: str) -> None:
-        """Hold; what was read before this happened no longer releases it."""
+        """Hold the queue; an earlier id no longer releases it."""
         new = Reason(at=utc_now(), why=printable(why))
         with self._lock:
             before = () if self._held is None else self._held.reasons
-            if before and before[0].why == new.why:  # as a button that is pressed again and again
+            if before and before[0].why == new.why:  # as of a button pressed repeatedly
                 before = before[1:]
             self._held = held = _held([new, *before])
         self.changed()
         self._events.publish("queue.held", {"why": why, "hold": held.id})
 
     def release(self, read: str) -> None:
-        """End the hold of this id. Raises `HoldChanged` where it is another."""
+        """Release the hold of this id. Raises `HoldChanged` for another one."""
         with self._lock:
             held = self._held
             if held is None:

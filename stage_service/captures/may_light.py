@@ -1,16 +1,13 @@
-"""May light be put on now? One table: every way that leads to a lamp, and all that refuses it.
+"""May light be put on now? One table: every way to a lamp, and every condition that refuses it.
 
-Whatever is lit is lit under a `Permission` (stage_service/devices/permission.py), and this table
-grants it: the wrappers of light bank, projectors and trigger box command nothing without one that
-is live. It is granted to one run, and what that run lights again (the next step, a missed frame, a
-sequence that the trigger box clocks) needs it to be live still. Blackout, abort, the latch, a
-standstill and the end of the service or of the run revoke it for good; a pause suspends it, and
-`resume` asks this table. A service starts without any, and with the queue held, so that after a
-start only a person's word puts a lamp on.
+A run lights under a `Permission` (stage_service/devices/permission.py), which is granted after this
+check: the wrappers of light bank, projectors and trigger box command nothing without a live one.
+Blackout, abort, the latch, a standstill and the end of the service or the run revoke it for good; a
+pause suspends it, and `resume` checks this table again. A service starts without a permission and
+with the queue held, so after a start only a person's word puts a lamp on.
 
-Arming is part of that word: `armed_by` answers for the flashes of one run, is on the disk before
-the first of them, and is kept for no other run. What is shot again after a restart, or started from
-the queue, has to be armed anew.
+`armed_by` arms the flashes of one run. It is on the disk before the first flash and is never used
+for another run: a run after a restart or from the queue has to be armed again.
 """
 
 from __future__ import annotations
@@ -26,9 +23,9 @@ from stage_service.records.audit import SERVICE
 from stage_service.records.lease import Lease, Leased
 
 Way = Literal["capture", "snapshot", "continue", "entry", "resume", "queue"]
-"""What puts light on: a person's `POST /captures` and `/snapshot`, `/captures/{id}/resume` of one
-that is done and did not complete, `/queue/{id}/start`, and `/captures/{id}/resume` after a pause;
-last the queue, by itself."""
+"""Ways to put light on: a person's `POST /captures` and `/snapshot`, `/captures/{id}/resume` of an
+ended, incomplete capture, `/queue/{id}/start`, and `/captures/{id}/resume` after a pause; last the
+queue, by itself."""
 
 TABLE = """
             capture   snapshot  continue  entry     resume    queue
@@ -44,8 +41,8 @@ leased      refused   refused   refused   refused   refused   refused
 held        -         -         -         -         -         refused
 flashes     refused   refused   refused   refused   -         refused
 """
-"""Conditions, in the order in which they are looked at, by ways. A run that resumes is the one that
-runs, and was armed when it started."""
+"""Conditions, in the order in which they are checked, by ways. A run that resumes is the running
+one and was armed when it started."""
 
 
 class Busy(RuntimeError):
@@ -57,18 +54,17 @@ class Busy(RuntimeError):
 
 
 class NotNow(RuntimeError):
-    """Light may not be put on at this moment; the message says why."""
+    """Light is refused now; the message has the reason."""
 
 
 STALE_S = 30.0
-"""A word counts for so many seconds: whoever gave it still looks at the stage. Reading a head and
-making a folder take less; a service that was stopped, or a machine that slept, takes longer."""
+"""Seconds for which a word is valid: the person who gave it still watches the stage. Reading a head
+and making a folder take less; a stopped service, or a machine that slept, takes longer."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """When a word was given: how often all permissions had been revoked by then, and
-    `boot_seconds`."""
+    """When a word was given: the number of revocations so far, and `boot_seconds`."""
 
     revocations: int
     at: float
@@ -76,8 +72,8 @@ class Moment:
 
 @dataclass(frozen=True)
 class Word:
-    """On whose word light is to go on: `lease` is the token that they sent, `armed_by` answers for
-    flashes, `who` is for the record. `given`: when; None: when it comes to the stage."""
+    """A person's word for light: `lease` is the token that they sent, `armed_by` arms flashes,
+    `who` is for the record. `given`: when; None: on arrival at the stage."""
 
     way: Way = "capture"
     lease: str | None = None
@@ -88,10 +84,10 @@ class Word:
 
 @dataclass(frozen=True)
 class Facts:
-    """How the stage is at one moment, as far as the table goes."""
+    """The conditions of the table at one moment."""
 
     closing: bool = False
-    """The service ends."""
+    """The service is closing."""
     darkening: bool = False
     """A blackout is under way."""
     revoked: bool = False
@@ -103,19 +99,20 @@ class Facts:
     latched: Latched | None = None
     """The last blackout was not verified."""
     unknown: bool = False
-    """Nobody has read back, or looked, whether the stage is dark."""
+    """Darkness was neither read back nor acknowledged by a person."""
     unread: int = 0
-    """Captures on the disk that were not read yet: one of them may be the queue's own."""
+    """Captures on the disk that were not read yet: one may be the queue's own."""
     leased: Lease | None = None
-    """Somebody else's."""
+    """Another caller's."""
     held: Held | None = None
-    """The queue is."""
+    """The queue's hold."""
     flashes: FlashRefusal | None = None
-    """The plan's flashes lack consent, or somebody who has armed them."""
+    """The plan's flashes lack consent or arming."""
 
 
 def check(way: Way, facts: Facts) -> None:
-    """Raise what refuses this way now: `NotNow`, `Busy`, `Unsafe`, `Leased`, `FlashRefusal`."""
+    """Raise the first condition that refuses this way: `NotNow`, `Busy`, `Unsafe`, `Leased`,
+    `FlashRefusal`."""
     for condition, refuses in _TABLE.items():
         if refuses[way] and (error := _ERRORS[condition](facts)) is not None:
             raise error
@@ -143,8 +140,6 @@ _ERRORS: dict[str, Callable[[Facts], Exception | None]] = {
     "held": lambda f: NotNow(f"held: {f.held.text}") if f.held is not None else None,
     "flashes": lambda f: f.flashes,
 }
-_UNKNOWN = "whether the stage is dark is not known: send a blackout"
-_STALE = (
-    "{:.0f} s passed before it could begin; whoever started it may no longer watch: start it again"
-)
+_UNKNOWN = "it is unknown whether the stage is dark: send a blackout"
+_STALE = "{:.0f} s passed before it could start; look at the stage, then start it again"
 _UNREAD = "the captures on the disk are still being read: {:,} to come"

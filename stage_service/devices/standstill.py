@@ -1,4 +1,4 @@
-"""Notices that this process, or its machine, stood still while something may have been lit."""
+"""Detects that this process, or its machine, stood still while lamps may have been lit."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from stage_service.records.clock import boot_seconds
 
 
 class Standstill:
-    """A context in which `found(why)` is called where this process did nothing for `limit_s`
-    seconds: it was stopped, starved, or the machine slept.
+    """A context that calls `found(why)` if this process did not run for `limit_s` seconds: it was
+    stopped, starved, or the machine slept.
 
-    Whatever was lit is dark by then, by the watchdogs of the devices, and whoever is at the stage
-    takes it to be off: nothing may resume by itself afterwards. A thread of its own, which waits
-    for no device, looks four times within the limit; `check` is for whoever is about to light
-    something, and may be the first to run again.
+    The devices' watchdogs have put the lamps off by then, and people at the stage take them to be
+    off: nothing may resume by itself. A thread of its own checks four times within the limit; call
+    `check` before lighting something, because that thread may run later.
     """
 
     def __init__(
@@ -40,7 +39,7 @@ class Standstill:
         self._thread.join()
 
     def check(self) -> None:
-        """Call `found` where the last look is too long ago."""
+        """Call `found` if the last check is too long ago."""
         still = self._clock() - self._last
         if still > self._limit_s:
             limit = f"watchdog_s = {self._limit_s:g}"

@@ -11,7 +11,7 @@ from stage_service.plan.stepping import LATENCY_S, UPLOAD_S, Run, period_s
 
 
 class Lit(NamedTuple):
-    """A step whose light goes on `at` seconds after the start, and stays on for `seconds`."""
+    """A step whose light is on from `at` seconds after the start, for `seconds`."""
 
     step: Step
     at: float

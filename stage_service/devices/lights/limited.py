@@ -64,7 +64,7 @@ class LimitedLightBank:
             self._refusal = None
 
     def close(self) -> None:
-        """Close the link; the lamps stay as they are and are no longer watched."""
+        """Close the link; the lamps stay as they are, without limits."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._changed.notify_all()
