@@ -303,7 +303,7 @@ def test_a_bank_that_was_started_anew_or_is_another_s_is_told_with_the_next_hear
     with pytest.raises(DeviceError, match=r"service 7's, received no owner"):
         driver.heartbeat()
     lamps.own(0, [9])
-    with pytest.raises(DeviceError, match=r"service 7's, received that of service 9"):
+    with pytest.raises(DeviceError, match=r"service 7's, received service 9"):
         driver.heartbeat()
     lamps.own(0, [0])
     assert driver.claim(7, "left:123") is None

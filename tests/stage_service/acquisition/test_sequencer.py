@@ -99,15 +99,6 @@ def test_a_frame_that_never_comes_is_recorded_with_its_reason(rig_file, world, t
     assert problem == "Step 2 (olat), cam_0 is missing: no frame from the camera after 3 pulses."
 
 
-def test_a_doubled_trigger_is_named_as_an_index_shift(rig_file, world, tmp_path):
-    world.double = {4}
-    run = sequencer(rig_file, tmp_path / "c")
-    assert run.run() == "failed"
-    assert "matching frames to pulses" in str(run.error)
-    assert "expected no frame beside those of our pulses" in str(run.error)
-    assert is_dark(world)
-
-
 def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world, tmp_path):
     """Cameras without a clock, which do not say what they hold: it shows at the next arming."""
     world.double = {4}
@@ -134,11 +125,6 @@ def test_frames_that_an_index_shift_put_in_doubt_are_shot_again(rig_file, world,
     for step, light in zip((2, 3, 4), LIGHTS, strict=True):
         counts = capture.frame(capture.steps[step], "cam_1") * GAIN * 0.01
         np.testing.assert_allclose(counts, int(light[-3:]) + 1, atol=2.5)
-
-
-def test_a_busy_camera_is_waited_for(rig_file, world, tmp_path):
-    world.busy = {"cam_1": 5}
-    assert sequencer(rig_file, tmp_path / "c").run() == "completed"
 
 
 @pytest.mark.parametrize(
@@ -303,17 +289,3 @@ def test_keyboard_interrupt_leaves_darkness_and_a_manifest(rig_file, world, tmp_
         run.run()
     assert is_dark(world)
     assert Capture(tmp_path / "c").manifest["outcome"] == "failed"
-
-
-def test_a_full_disk_fails_the_capture(rig_file, world, tmp_path):
-    run = sequencer(rig_file, tmp_path / "c")
-    step, camera = run._writer.missing()[-1]
-    folder = tmp_path / f"c/frames/{step.index:05d}"
-    folder.mkdir()
-    (folder / f".part-{camera}.exr").symlink_to("/dev/full")
-    assert run.run() == "failed"
-    assert "No space left" in str(run.error)
-    assert is_dark(world)
-    failed, absent = verify(tmp_path / "c")
-    assert failed == "The capture's outcome is 'failed', not 'completed'."
-    assert absent.startswith("1 planned frames were never shot")

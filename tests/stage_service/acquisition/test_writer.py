@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from waiting import until
 
 from reconstruction import Camera, CaptureWriter, Rig, Step
 from stage_service.acquisition.frame_queue import FrameWriter, Shot, queued_frames
@@ -136,22 +135,6 @@ def test_put_goes_on_raising_after_an_error(folder, monkeypatch):
     for step in STEPS[1:4]:
         with pytest.raises(OSError, match="No space left"):
             writer.put(shot(step))
-    with pytest.raises(OSError, match="No space left"):
-        writer.close()
-    folder.close()
-
-
-def test_what_writing_raises_reaches_the_sequencer(folder, monkeypatch):
-    def full(*_args: Any, **_more: Any) -> Any:
-        raise OSError(28, "No space left on device")
-
-    writer = FrameWriter(folder, 2)
-    writer.put(shot(STEPS[0]))
-    monkeypatch.setattr(folder, "store_frame", full)
-    writer.put(shot(STEPS[1]))
-    until(lambda: writer._error is not None)
-    with pytest.raises(OSError, match="No space left"):
-        writer.put(shot(STEPS[2]))
     with pytest.raises(OSError, match="No space left"):
         writer.close()
     folder.close()

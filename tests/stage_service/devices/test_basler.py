@@ -19,7 +19,7 @@ from simulators.frames.frames import Sensor
 from stage_service.acquisition.accounting import FrameAccount
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera, BlockCounter
-from stage_service.devices.errors import Cancelled, DeviceError, DeviceUnreachable, IndexShift
+from stage_service.devices.errors import DeviceError, DeviceUnreachable, IndexShift
 
 WIDTH, HEIGHT = 32, 24
 SENSOR = Sensor()
@@ -190,28 +190,6 @@ def test_mono_stands_in_every_channel(make, pixel_format, full_scale):
     assert camera.info.full_scale == full_scale > counts.max() > full_scale // 8
 
 
-def test_block_ids_go_on_where_the_camera_begins_again(camera):
-    assert camera.read(NEVER) is None  # not armed
-    camera.arm(EXPOSURE)
-    pulse(camera)
-    pulse(camera)
-    assert [camera.read(NEVER).block_id for _ in range(2)] == [1, 2]
-    assert camera.read(NEVER) is None
-    pulse(camera)
-    pulse(camera)
-    # A camera that is ready for the next pulse may still be bringing its last frames.
-    until(lambda: camera._camera.NumReadyBuffers.Value == 2)
-    camera.arm(2 * EXPOSURE)  # empties the queue
-    assert camera.read(NEVER) is None
-    pulse(camera)
-    frame = camera.read(NEVER)
-    assert frame.block_id == 5
-    assert frame.exposure == 2 * EXPOSURE
-    pulse(camera)
-    camera.disarm()
-    assert camera.read(NEVER) is None
-
-
 def test_an_overtrigger_leaves_no_gap(camera):
     account = FrameAccount(camera.name, camera.capabilities.block_wrap)
     camera.arm(EXPOSURE)
@@ -262,16 +240,6 @@ def test_two_cameras_are_told_apart_by_serial_number(camera, make):
     pulse(other)
     assert other.read(NEVER).block_id == 1
     assert camera.read(NEVER) is None
-
-
-def test_a_wait_for_a_frame_can_be_given_up(make):
-    camera = make(frame_s=60.0)
-    camera.connect()
-    camera.arm(EXPOSURE)
-    cancel = threading.Event()
-    cancel.set()
-    with pytest.raises(Cancelled, match="reading a frame was given up"):
-        camera.read(cancel)
 
 
 def features(**changed: object) -> dict[str, object]:

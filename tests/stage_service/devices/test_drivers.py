@@ -27,11 +27,9 @@ from stage_service.devices.errors import (
     DeviceError,
     DeviceTimeout,
     DeviceUnreachable,
-    SafetyRefusal,
 )
 from stage_service.devices.heartbeat import Heartbeat
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
-from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
@@ -45,53 +43,6 @@ def stage(rig_file: RigFile) -> Iterator[DeviceSet]:
     one.connect()
     yield one
     one.close()
-
-
-def test_light_bank_lights_exactly_what_it_is_told(stage, world):
-    stage.lights.select(3)
-    assert world.lit == {3}
-    stage.lights.all_on()
-    assert len(world.lit) == 200
-    stage.lights.off()
-    assert world.lit == set()
-    stage.lights.set_level(0.5)
-    assert world.levels == [32768] * 200
-    stage.lights.set_watchdog(1.25)
-    assert world.watchdog_ms == 1250
-    with pytest.raises(ValueError, match="lamps are 0 to 199, got 200"):
-        stage.lights.select(200)
-
-
-def test_light_bank_status(stage, world):
-    world.lit, world.estop = {1, 2}, True
-    status = stage.lights.status()
-    assert (status.lit, status.estop_pressed, status.interlock_open) == (2, True, False)
-
-
-def test_light_bank_exception_replies_are_errors(stage):
-    with pytest.raises(DeviceError, match=r"watchdog to 0.05 s: .* Modbus exception 3"):
-        stage.lights.set_watchdog(0.05)
-
-
-def test_light_bank_of_another_size_is_refused(rig_file):
-    assert rig_file.devices is not None
-    bank = ModbusLightBank(rig_file.devices.lights, 331)
-    with pytest.raises(DeviceError, match="expected 331 lamps as in the rig file, received 200"):
-        bank.connect()
-    bank.close()
-
-
-def test_a_mute_light_bank_misses_its_deadline_and_comes_back(stage, rig_file, world, slack):
-    with world.lock:  # the peer cannot answer meanwhile
-        start = time.monotonic()
-        with pytest.raises(DeviceTimeout) as error:
-            stage.lights.select(3)
-        assert time.monotonic() - start < 1.0 * slack
-    assert error.value.deadline_s == rig_file.devices.lights.timeout_s
-    assert "putting lamp 3 on" in str(error.value)
-    until(lambda: world.lit == {3})  # the peer executes the command late, and answers nobody
-    stage.lights.select(4)
-    assert world.lit == {4}
 
 
 def test_heartbeats_come_while_it_runs_and_trouble_is_kept(stage, world, monkeypatch):
@@ -111,39 +62,6 @@ def test_heartbeats_come_while_it_runs_and_trouble_is_kept(stage, world, monkeyp
     seen = world.heartbeats
     assert threading.Event().wait(0.05) is False
     assert world.heartbeats == seen
-
-
-def test_trigger_box(stage, world):
-    assert [stage.trigger.pulse(0.001), stage.trigger.pulse(0.02)] == [1, 2]
-    assert world.requests[-2:] == ["PULSE 1000", "PULSE 20000"]
-    assert stage.trigger.count() == 2
-    stage.trigger.reset()
-    assert stage.trigger.count() == 0
-    world.interlock = True
-    assert stage.trigger.status().interlock_open
-    with pytest.raises(SafetyRefusal, match="refusal: interlock or emergency stop"):
-        stage.trigger.pulse(0.001)
-    with pytest.raises(ValueError, match="exposure must be"):
-        stage.trigger.pulse(11.0)
-
-
-def test_a_late_serial_reply_never_answers_the_next_request(stage, world):
-    stage.trigger.pulse(0.001)
-    world.late = ["COUNT?"]
-    with pytest.raises(DeviceTimeout, match=r"reading the pulse count: .*within"):
-        stage.trigger.count()
-    status = stage.trigger.status()
-    assert not status.estop_pressed
-    assert world.requests[-4:] == ["COUNT?", "?", "ID?", "STATUS?"]
-
-
-@pytest.mark.parametrize("garbage", [b"\xff\x00", b"noise\n"])
-def test_garbage_on_the_serial_line_is_shown(stage, world, garbage):
-    world.garbage = garbage
-    with pytest.raises(DeviceError, match="reading the pulse count") as error:
-        stage.trigger.count()
-    assert repr(garbage.decode("ascii", "backslashreplace").strip())[1:-1] in str(error.value)
-    assert not stage.trigger.status().estop_pressed  # the count came after it, and is not taken
 
 
 def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):
@@ -234,19 +152,6 @@ def test_a_widget_that_sends_on_and_on_does_not_hold_its_lamps():
     thread.join(30)
     assert [type(error) for error in found] == [DeviceTimeout]
     assert shown == b"\x7e\x06\x19\x00" + bytes(25) + b"\xe7"
-
-
-def test_projectors(stage, world):
-    assert stage.projectors is not None
-    stage.projectors.line("right", 7, 0.5)
-    assert world.show == "LINE right 7 32768"
-    assert not stage.projectors.is_dark()
-    stage.projectors.all_on(1.0)
-    assert world.show == "ON 65535"
-    stage.projectors.off()
-    assert stage.projectors.is_dark()
-    with pytest.raises(DeviceError, match="ERR 2 unknown projector"):
-        stage.projectors.line("middle", 7, 0.5)
 
 
 def test_a_camera_gives_radiance(stage, world):

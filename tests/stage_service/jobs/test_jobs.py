@@ -65,13 +65,6 @@ def test_a_job_without_a_worker_waits_and_can_be_cancelled(queue: JobQueue, tmp_
         queue.get("nope")
 
 
-def test_submitting_an_id_twice_is_one_job(queue: JobQueue, tmp_path: Path) -> None:
-    for _ in range(2):
-        request, model = PipelineRequest(name="fit"), Model(tmp_path / "m")
-        queue.submit(request, tmp_path / "c", model, job="job-of-capture-1")
-    assert [j.id for j in queue.all()] == ["job-of-capture-1"]
-
-
 def test_unknown_pipelines_and_options_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"no pipeline 'lightplanes'.*'light_planes'"):
         PipelineRequest(name="lightplanes")
