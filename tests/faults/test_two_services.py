@@ -157,5 +157,5 @@ def test_a_capture_ends_where_the_bank_was_started_anew(simulated, begin):
     world.lamps.own(0, [0])
     found = service.wait(capture, 60)
     assert found.outcome == "failed"
-    assert "it was started anew" in str(found.error)
+    assert "received no owner" in str(found.error)
     assert not world.lamps.power().any()

@@ -233,7 +233,7 @@ CASES += [
     case("light bank: garbage in a reply", "lights", "garbage", "failed", "light bank", **SELECT),
     case("light bank: late reply", "lights", "late", "failed", "light bank.*within {timeout} s",
          seconds=0.45, **SELECT),
-    case("light bank: wrong echo", "lights", "echo", "failed", "light bank.*answer", **SELECT),
+    case("light bank: wrong echo", "lights", "echo", "failed", "light bank.*reply", **SELECT),
     case("light bank: CRC error", "lights", "crc", "failed", "light bank",
          **{**SELECT, "links": ("Modbus RTU",)}),
     case("light bank: unplugged and plugged in again", "lights", "unplug", "failed", "light bank",

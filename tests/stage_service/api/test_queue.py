@@ -145,7 +145,7 @@ def test_a_plan_that_flashes_is_started_by_somebody_who_answers_for_it(rig_file,
         flashing = add(http, {"plan": {**IN_BAND, "consent": CONSENT}})
         behind = add(http, {"plan": {**IN_BAND, "rate_hz": 2.5, "lights": ["light_003"]}})
         http.service.events.wait(http.service.events.last, 1.2)
-        assert "somebody at the stage" in http.get("/queue").json()["waits_for"]
+        assert "a person at the stage" in http.get("/queue").json()["waits_for"]
         assert world.pulses == 0
         refused = http.post(f"/queue/{flashing}/start", json={})
         assert slug(refused) == "flash-rate"
@@ -247,11 +247,11 @@ def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, t
 def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
     """Every second row: plans of earlier versions could have that."""
     old = {"id": "q-1", "by": "Ada", "added": "", "request": {"plan": {"rows": {"step": 2}}}}
-    (tmp_path / "queue.json").write_text(json.dumps({"held": "by Ada", "waiting": [old]}))
+    (tmp_path / "queue.json").write_text(json.dumps({"held": [], "waiting": [old]}))
     with serving(rig_file, tmp_path) as http:
         refused = http.post("/queue/q-1/start")
         assert slug(refused) == "bad-input"
-        assert "q-1 is what another version could shoot: plan.rows.step" in refused.json()["detail"]
+        assert "q-1 was queued by another version: plan.rows.step" in refused.json()["detail"]
         http.go_on()
         held = until(lambda: http.get("/queue").json()["held"])
         assert held.startswith("q-1 cannot begin: q-1 is what another version could shoot")

@@ -362,7 +362,7 @@ def test_a_capture_of_a_plan_of_another_version_is_not_continued(http):
     told["plan"]["rows"]["step"] = 2
     file.write_text(json.dumps(told))
     problem = refused(http.post(f"/captures/{capture}/resume"), "invalid-plan")
-    assert "plan is one of another version: rows.step: Input should be 1" in problem["detail"]
+    assert "plan is not of this version: rows.step: Input should be 1" in problem["detail"]
     assert done(http, capture)["outcome"] == "aborted"
 
 
