@@ -85,7 +85,7 @@ class FrameIntake:
                 account.timed(frame.timestamp, pulse.requested, pulse.replied)
 
     def place(self, shots: Shots) -> dict[str, list[int] | None]:
-        """By camera, the pulse of a hardware-stepped run that each frame belongs to; None where        that is ambiguous."""
+        """By camera, the pulse of a hardware-stepped run of each frame; None if ambiguous."""
         return {
             name: self._accounts[name].place([f.block_id for f in frames], shots.progress.pulses)
             for name, frames in shots.frames.items()

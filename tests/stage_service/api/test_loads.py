@@ -400,7 +400,7 @@ def test_it_darkens_first_and_starts_whatever_lies_in_its_folder(
         until(lambda: http.get("/health").json()["problems"])
         health = http.get("/health").json()
         assert health["status"] == "degraded"  # the latch was cleared by the blackout at the start
-        assert "set aside" in health["problems"][0]
+        assert "renamed to" in health["problems"][0]
         assert http.get("/jobs").json() == []
         assert http.get("/audit").status_code == 200
 

@@ -254,7 +254,7 @@ def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
         assert "q-1 was queued by another version: plan.rows.step" in refused.json()["detail"]
         http.go_on()
         held = until(lambda: http.get("/queue").json()["held"])
-        assert held.startswith("q-1 cannot begin: q-1 is what another version could shoot")
+        assert held.startswith("q-1 cannot begin: q-1 was queued by another version")
         assert "\n" not in held
 
 
