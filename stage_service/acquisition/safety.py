@@ -64,12 +64,20 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
     """Put lamps and projectors off, in parallel, and read them back; never raises for a device.
 
     A device that fails is tried again on a new connection. A device not verified within `within_s`
-    seconds is reported as "unknown, unsafe"; its attempts go on.
+    seconds is reported as "unknown, unsafe"; its attempts go on. `detail` names what else puts the
+    lamps off: watchdog, interlock, emergency stop.
     """
     lights, beams, config = devices.lights, devices.projectors, devices.config
-    problems = unread = ""
+    problems = unread = causes = ""
+
+    def lamps_are_off() -> bool:
+        nonlocal causes
+        status = lights.status()
+        causes = status.causes.removeprefix(", ")
+        return status.lit == 0
+
     lit: list[tuple[LightBank | ProjectorController, Callable[[], bool]]]
-    lit = [(lights, lambda: lights.status().lit == 0)]
+    lit = [(lights, lamps_are_off)]
     if beams is not None:
         lit.append((beams, beams.is_dark))
     found = [
@@ -96,6 +104,8 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
             unread += f" {device.name}: off was sent, but cannot be read back."
     if not problems and not unread:
         dark = "every lamp and projector was read back dark"
+        if causes:
+            dark += f"; {lights.name} reported then: {causes}"
         if lights.contradicted:
             dark += f"; earlier {lights.name} {CONTRADICTED}: look before anybody goes in"
         return Blackout(True, dark)

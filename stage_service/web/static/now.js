@@ -143,7 +143,8 @@ export function open(view) {
   function lamps() {
     const { state, fact, detail } = lampWords(S.health);
     const kind = silence() ? "b.bad" : { latched: "b.bad", unknown: "b.bad", accepted: "b.warn", doubted: "b.warn" }[state] ?? "span";
-    return ["Lamps", h(kind, { title: detail }, state === "use" && S.capture?.state === "paused" ? "put off for the pause" : fact)];
+    const besides = state === "dark" && !silence() ? detail.split(/(?=; )/).slice(1).join("").replace(/\.$/, "") : ""; // what else puts them off
+    return ["Lamps", h(kind, { title: detail }, state === "use" && S.capture?.state === "paused" ? "put off for the pause" : fact + besides)];
   }
   function disk() {
     const free = S.health?.disk_free_bytes;

@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import pytest
+
 from stage_service.acquisition.safety import blackout
 from stage_service.devices.errors import DeviceTimeout
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus
@@ -42,6 +44,18 @@ class Contradicted(Broken):
         return LightStatus(False, False, False, 0)
 
 
+class Stopped(Contradicted):
+    """A light bank whose lamps are off by more than the command."""
+
+    contradicted = False
+
+    def __init__(self, *causes: bool) -> None:
+        self.causes = causes
+
+    def status(self):
+        return LightStatus(*self.causes, 0)
+
+
 class Silent:
     """A light bank that obeys and cannot say so."""
 
@@ -74,6 +88,22 @@ def test_dark_by_a_contradicted_read_back_is_said_to_be_that():
     result = blackout(stage(Contradicted(), Beams()))
     assert result.state == "dark"
     assert "earlier lights reported lamps as off that were commanded on" in result.detail
+
+
+@pytest.mark.parametrize(
+    ("causes", "named"),
+    [
+        ((True, False, False), "its watchdog has tripped"),
+        ((False, True, False), "the interlock is open"),
+        ((False, False, True), "the emergency stop is pressed"),
+        ((False, True, True), "the interlock is open, the emergency stop is pressed"),
+    ],
+)
+def test_what_else_puts_the_lamps_off_is_named_in_the_detail(causes, named):
+    result = blackout(stage(Stopped(*causes), Beams()))
+    dark = "every lamp and projector was read back dark"
+    assert (result.state, result.detail) == ("dark", f"{dark}; lights reported then: {named}")
+    assert blackout(stage(Stopped(False, False, False), Beams())).detail == dark
 
 
 def test_what_cannot_be_read_back_is_unknown_and_blocks_unless_that_is_accepted():

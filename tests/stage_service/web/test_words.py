@@ -71,6 +71,8 @@ def test_an_emergency_stop_is_named_apart_from_watchdog_and_interlock(console):
     assert "emergency stop" in alarm
     assert "watchdog" not in alarm
     assert "interlock" not in alarm.replace("interlock closed", "")
+    page.keyboard.press("F9")
+    page.wait_for_selector("dd:has-text('reported then: the emergency stop is pressed')")
 
 
 def test_times_are_those_of_the_clock_on_the_wall(console, monkeypatch):
