@@ -415,7 +415,7 @@ def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_
 def test_a_pipeline_that_cannot_run_is_refused_before_the_capture(http, world, head):
     for pipeline, given, why in (
         ("light_planes", {}, "give the head"),
-        ("fit", {"head": head}, "strands that are there already"),
+        ("fit", {"head": head}, "needs existing strands"),
     ):
         refused = http.post("/captures", json={"pipeline": {"name": pipeline}, **given})
         assert why in problem(refused, "bad-input")["detail"]

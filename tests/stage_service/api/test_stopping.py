@@ -49,7 +49,7 @@ def test_blackout_and_health_are_answered_while_it_stops(rig_file, world, tmp_pa
                 server.handle_exit(signal.SIGTERM, None)
                 closing.wait()
                 health = http.get("/health").json()
-                told = "the service is stopping: it lights nothing any more"
+                told = "the service is stopping and lights nothing"
                 assert (health["status"], health["problems"]) == ("degraded", [told])
                 assert http.post("/captures", json={}).status_code == 409
                 world.lit = {3}

@@ -114,17 +114,17 @@ def test_workers_disk_and_jobs_are_as_they_were_last_seen(rig_file, tmp_path, mo
         free = threading.Event()
         monkeypatch.setattr(shutil, "disk_usage", lambda _: free.wait() and usage)
         assert figures(http)[("disk_free_bytes",)] == 1e7  # it hangs: as it was last seen
-        assert "does not answer" in http.get("/ready").json()["problems"][0]
+        assert "does not respond" in http.get("/ready").json()["problems"][0]
         free.set()
 
 
 def test_a_disk_that_has_gone_is_told_and_nothing_is_shot_in_its_place(rig_file, world, tmp_path):
     with serving(rig_file, tmp_path) as http:
         (tmp_path / "captures").rename(tmp_path / "unmounted")
-        assert "is its disk there?" in http.get("/ready").json()["problems"][0]
+        assert "check its disk" in http.get("/ready").json()["problems"][0]
         refused = http.post("/captures", json={"plan": {}}).json()
         assert (refused["status"], refused["type"]) == (422, "/docs/errors.md#invalid-plan")
-        assert "captures is not there" in refused["detail"]
+        assert "captures does not exist" in refused["detail"]
         assert http.post("/devices/blackout").json()["state"] == "dark"
         assert not (tmp_path / "captures").exists()
         (tmp_path / "unmounted").rename(tmp_path / "captures")
