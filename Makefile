@@ -32,7 +32,7 @@ test-all: setup test-peers  ## Run the slow tests too (under 60 minutes)
 	@$(MAKE) --no-print-directory -k -j 2 lint run-tests WHICH='slow or not slow'
 
 run-tests:
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(or $(WHICH),not slow)'
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m '$(or $(WHICH),not slow)'
 
 test-peers:  ## Install the programs that tests talk to, where that needs no password
 	@for program in mbpoll chromium; do command -v $$program >/dev/null \

@@ -304,6 +304,7 @@ def test_a_sweep_is_triangulated(
     assert len(read_strands(tmp_path / "strands.npz")) > 20
 
 
+@pytest.mark.slow
 def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
 ) -> None:

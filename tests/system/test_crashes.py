@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from waiting import until
 
 from reconstruction import Capture
 
 
+@pytest.mark.slow
 def test_a_killed_service_leaves_no_lamp_lit_and_every_finished_frame(stage):
     pulse = 8
     stage.simulate([{"device": "trigger", "kind": "silent", "pulse": pulse}])

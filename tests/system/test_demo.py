@@ -73,6 +73,7 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
     assert processes_of(out) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_in_order_and_its_folder_may_be_used_again(stage):
     out = stage.folder / "demo"
     old = out / "captures" / "old"

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_exactly_the_dropped_frame_is_captured_again(stage):
     pulse = 6
     stage.simulate([{"device": "camera", "kind": "drop", "pulse": pulse, "camera": "cam_1"}])

@@ -41,7 +41,9 @@ def test_it_is_the_mean_of_the_near_field_over_the_width(beta_n):
             assert far == pytest.approx(near, rel=0.005)
 
 
-@pytest.mark.parametrize("beta_m", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "beta_m", [0.05, *(pytest.param(b, marks=pytest.mark.slow) for b in (0.3, 1.0))]
+)
 def test_the_table_on_the_device_gives_the_near_fields_mean_over_half_of_the_width(beta_m):
     """Directions along the fibre, grazing, and onto the middle of TT among them."""
     ensure_backend()

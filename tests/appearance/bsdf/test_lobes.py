@@ -30,7 +30,7 @@ def scattered(case: Case, count: int = 300, seed: int = 0) -> np.ndarray:
     return reference.direction(np.concatenate(along), np.concatenate(around))
 
 
-@pytest.mark.parametrize("sigma_a", [0.0, 0.3, 1e4])
+@pytest.mark.parametrize("sigma_a", [0.0, pytest.param(0.3, marks=pytest.mark.slow), 1e4])
 def test_float64_matches_the_reference(sigma_a):
     for case in cases(40, seed=3):
         # |h| = 1 at a grazing angle: the printed forms lose half their digits

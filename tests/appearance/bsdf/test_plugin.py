@@ -194,6 +194,7 @@ def test_a_volume_is_looked_up_by_strand_and_place_on_it(tuft):
     assert got == pytest.approx(want, abs=0.02)
 
 
+@pytest.mark.slow
 def test_lookups_are_exact_among_millions_of_segments():
     """4 million segments: a float32 has no room for one coordinate over all of them."""
     strands, each = 40_000, 100

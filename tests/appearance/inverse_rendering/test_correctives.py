@@ -26,6 +26,7 @@ def solve(tufted, truth: HairMaps, **more):
     return raw, [solve_correctives(problem, raw, gain, EFFORT, seed=s, **more) for s in draws]
 
 
+@pytest.mark.slow
 def test_a_turn_that_all_fibres_share_is_found(tufted):
     rotation = np.broadcast_to(TURN, (1, 1, 1, 2))
     truth = replace(HairMaps.of(tufted.truth), rotation=rotation)
@@ -38,11 +39,8 @@ def test_a_turn_that_all_fibres_share_is_found(tufted):
     assert all((draw.raw[name] == raw[name]).all() for name in others for draw in found)
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [(2, 1, 1), pytest.param((1, 2, 1), marks=pytest.mark.slow)],
-    ids=["layers", "cells"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [(2, 1, 1), (1, 2, 1)], ids=["layers", "cells"])
 @pytest.mark.parametrize(("lambda_r", "apart"), [(1e-4, True), (10.0, False)])
 def test_neighbours_are_held_together_by_their_weight(tufted, shape, lambda_r, apart):
     turns = np.array([[0.2, 0.0], [-0.2, 0.0]]).reshape(*shape, 2)

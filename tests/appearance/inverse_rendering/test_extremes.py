@@ -41,6 +41,7 @@ def test_black_hair_is_found_darker_than_the_start(tufted):
     assert found.sigma_a.min() > 1.3 * START.sigma_a[0]
 
 
+@pytest.mark.slow
 def test_white_hair_is_found_lighter_than_the_start(tufted):
     truth = HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3)
     # light goes far in it: of few paths, one bright one decides whether the fit is taken

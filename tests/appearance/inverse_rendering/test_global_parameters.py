@@ -48,7 +48,7 @@ def test_all_are_found_together(plain, tufted, start):
 
 @pytest.mark.parametrize(
     ("beta_m", "beta_n"),
-    [(0.05, 0.3), (0.8, 0.3), pytest.param(0.7, 0.7, marks=pytest.mark.slow)],
+    [(0.05, 0.3), *(pytest.param(*b, marks=pytest.mark.slow) for b in ((0.8, 0.3), (0.7, 0.7)))],
 )
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
@@ -60,6 +60,7 @@ def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_white_hair(tufted):
     """What is left of its light after a crossing; the roughness of a lobe that all light makes."""
     truth = replace(tufted.truth, sigma_a=(0.001, 0.002, 0.008))
@@ -87,6 +88,7 @@ def test_black_hair(tufted, begins, names, off, left):
     assert left_open["sigma_a"] > 0.4
 
 
+@pytest.mark.slow
 def test_intensities_are_found_and_their_mean_is_kept(tufted):
     plain = tufted.problem(spp=2048)
     off = np.exp(0.06 * np.array([1, -1, 1, -1, 1, -1, 1, -1]))

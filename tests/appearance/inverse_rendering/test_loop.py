@@ -82,6 +82,7 @@ def test_an_interrupted_fit_does_not_begin_again(
     assert len(resumed.history) == len(whole.history)
 
 
+@pytest.mark.slow
 def test_what_comes_again_and_spoils_what_was_found_is_not_taken(
     plain, tufted, original, monkeypatch
 ):

@@ -278,6 +278,7 @@ print(before[0], stage.figures["memory_needed_gb"], stage.peak_gb)
 """
 
 
+@pytest.mark.slow
 def test_the_predicted_memory_is_what_the_process_takes(made, tmp_path):
     """By the kernel's own account of a process that does nothing else."""
     if str(mi.variant()).startswith("cuda"):
@@ -302,6 +303,7 @@ def test_unknown_fields_of_the_fit_are_refused_by_name():
         parse_options(InverseRenderingRequest, {"fit": {"stepps": 3}})
 
 
+@pytest.mark.slow
 def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_path):
     """A board under the tuft, of which the capture knows nothing, hides the lights below it."""
     capture, model = made

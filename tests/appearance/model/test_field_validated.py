@@ -165,6 +165,7 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
     assert sum("30.00 dB against 29.50" in w for w in warnings) == 1
 
 
+@pytest.mark.slow
 def test_an_earlier_field_stays_until_a_better_one_or_none_replaces_it(own, monkeypatch):
     capture, model = own
     right, found = validated.fit_field, []
@@ -209,6 +210,7 @@ def test_of_one_camera_and_three_lights_none_is_left_out_and_the_field_is_not_re
     assert sum("nothing could be left out" in w for w in told) == 1
 
 
+@pytest.mark.slow
 def test_a_killed_fit_renders_no_view_twice_and_memory_is_refused(own, monkeypatch):
     capture, model = own
 

@@ -163,6 +163,7 @@ def test_indirect_light_is_what_direct_light_lacks(small, tufted):
     assert not render_indirect(flat, camera, lights, pixels, spp=4, max_depth=4).any()
 
 
+@pytest.mark.slow
 def test_fibres_that_answer_by_their_width_scatter_less(small, monkeypatch):
     """Beside fibres that answer where they are met: the same light, and half of the noise.
 

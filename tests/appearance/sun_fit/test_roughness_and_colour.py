@@ -184,6 +184,7 @@ def test_colour_of_rendered_hair_is_recovered(wisp):
     assert found.errors[-1] < found.errors[0]
 
 
+@pytest.mark.slow
 def test_what_strands_lack_does_not_lighten_the_hair(wisp):
     """A third of the pixels shows hair like the rest, where there is no strand."""
     strands, camera, lights = wisp
@@ -216,6 +217,7 @@ def brighter_behind(wisp):
     return scene, replace(o, radiance=o.radiance * gain[:, None, None])
 
 
+@pytest.mark.slow
 def test_colours_are_compared_under_lights_before_the_hair(brighter_behind):
     scene, o = brighter_behind
     seen = FitPixels([o])
@@ -246,6 +248,7 @@ def test_poor_evidence_of_colours_is_warned_of(brighter_behind):
         assert any(what in warning for warning in stage.warnings)
 
 
+@pytest.mark.slow
 def test_lights_that_disagree_are_in_the_absorption_s_error(brighter_behind, monkeypatch):
     """The logs of the gains, ±0.18 and 0, are 0.105 off in the mean of three."""
     monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 30_000)

@@ -54,6 +54,7 @@ def test_a_folder_without_its_truth_is_named(tmp_path):
         agreement(tmp_path, tmp_path)
 
 
+@pytest.mark.slow
 def test_agrees_with_blender_cycles_and_with_mitsuba(shared_data, tmp_path):
     folder = shared_data("captures/cycles_wavy")
     result = agreement(tmp_path, folder, cameras=(4,), lights=(6, 9), seeds=2, spp=8)

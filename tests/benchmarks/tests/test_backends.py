@@ -59,6 +59,7 @@ def test_a_gpu_alone_that_is_not_there_is_a_failure(monkeypatch, tmp_path, capsy
     assert "leave --variants out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [LLVM, CUDA])
 def test_a_job_runs_in_a_process_of_its_own_whose_variant_it_is(variant, monkeypatch) -> None:
     monkeypatch.setenv(VARIANT, "mine")
@@ -70,6 +71,7 @@ def _tells() -> Done:
     return Done(0, 0, np.zeros(0, np.float32), {os.environ[VARIANT]: 1})
 
 
+@pytest.mark.slow
 def test_a_job_that_fails_is_told_with_its_error() -> None:
     with pytest.raises(ValueError, match="no back end"):
         done_by(LLVM, partial(_fails, "no back end"))

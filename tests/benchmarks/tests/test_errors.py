@@ -27,6 +27,7 @@ def test_lights_that_reach_nothing_are_left_out():
         relative_mse(truth * 0, truth * 0, truth * 0)
 
 
+@pytest.mark.slow
 def test_a_small_run_writes_figures_and_plots(tmp_path, small):
     subject = Subject(
         small.tuft(100), small.plane(), HairAppearance((0.5, 0.6, 0.8), 0.3, 0.3), (0.3, 0.3, 0.3)

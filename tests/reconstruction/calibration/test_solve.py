@@ -49,6 +49,7 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
     assert said["stages"]["lights"]["undetermined"] == {}
 
 
+@pytest.mark.slow
 def test_a_square_of_another_length_than_told_is_warned_of(
     nominal_rig: Rig, board_captures: list[Capture]
 ) -> None:
@@ -99,6 +100,7 @@ class Glaring(Capture):
         return image, saturated
 
 
+@pytest.mark.slow
 def test_what_shines_beside_a_mirror_is_warned_of(
     nominal_rig: Rig, board_captures: list[Capture], mirror_captures: list[Capture]
 ) -> None:

@@ -114,6 +114,7 @@ def test_a_mirror_alone_says_where_lights_are_when_its_places_are_wide_apart(
         assert lights[true.name].intensity_deviation is None
 
 
+@pytest.mark.slow
 def test_one_place_seen_by_one_pixel_leaves_the_distance_open(
     nominal_rig: Rig, glints: list[Glint]
 ) -> None:

@@ -155,12 +155,9 @@ def test_points_that_are_no_head_are_a_capture_error(capture: Capture, tmp_path:
         fit_capture_head(known, None, Stage("head"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("file", "above"),
-    [
-        ("lee_perry_smith.obj", None),
-        pytest.param("makehuman_base.obj", 6.0, marks=pytest.mark.slow),
-    ],
+    ("file", "above"), [("lee_perry_smith.obj", None), ("makehuman_base.obj", 6.0)]
 )
 def test_the_users_head_is_a_template(
     file: str,

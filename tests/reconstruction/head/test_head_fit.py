@@ -240,6 +240,7 @@ def the_head_in(path: Path, above: float) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "above", "scale"),
     [("lee_perry_smith.obj", -1.0, 1.14), ("makehuman_base.obj", 6.0, 10.2)],

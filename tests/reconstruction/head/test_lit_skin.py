@@ -155,6 +155,7 @@ def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -
     assert np.median(ClosestPoint(fitted, 8e-3)(scalp)[2]) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_lamp_that_gives_no_light_does_not_move_the_head(head: Mesh) -> None:
     """Its frames hold noise; the head is where it is without them."""
 
@@ -171,6 +172,7 @@ def test_a_lamp_that_gives_no_light_does_not_move_the_head(head: Mesh) -> None:
     assert np.median(ClosestPoint(head, 8e-3)(found.points)[2]) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     head: Mesh, tmp_path: Path
 ) -> None:

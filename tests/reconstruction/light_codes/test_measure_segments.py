@@ -62,6 +62,7 @@ def test_photometric_finds_the_fibres_and_reports_what_it_saw(
     assert (strands.roots[:, 2] >= strands.points[strands.offsets[1:] - 1][:, 2]).all()
 
 
+@pytest.mark.slow
 def test_the_baseline_runs_on_the_same_capture(shot: Capture, fibres: Any, tmp_path: Path) -> None:
     run(part_of(shot, cameras=len(fibres.cameras), lights=12), tmp_path, "lmvs")
     figures = compare_strands(read_strands(tmp_path / "strands.npz"), fibres.strands, samples=None)

@@ -131,6 +131,7 @@ def test_one_camera_is_an_error(stage: Shoot, cameras: list[Camera], tmp_path: P
         reconstruct(stage(cameras=cameras[:1]), Model(tmp_path), options=QUICK)
 
 
+@pytest.mark.slow
 def test_rays_within_their_planes_leave_the_masks_alone(
     stage: Shoot,
     stage_camera: MakeCamera,
@@ -162,6 +163,7 @@ def test_empty_masks_are_an_error(stage: Shoot, tmp_path: Path) -> None:
         reconstruct(capture, Model(tmp_path), options=QUICK)
 
 
+@pytest.mark.slow
 def test_a_subject_away_from_its_head_is_an_error(stage: Shoot, tmp_path: Path) -> None:
     """Head and cameras in different frames: nothing of the hair is where strands can begin."""
     with pytest.raises((CaptureError, NoScalp), match=r"head|scalp"):

@@ -128,6 +128,7 @@ def fine(points: np.ndarray) -> np.ndarray:
     return out
 
 
+@pytest.mark.slow
 def test_a_subject_that_moves_by_more_than_its_detail_is_followed(
     shoot: Callable[..., Capture],
     stage_camera: Callable[..., Camera],

@@ -406,6 +406,7 @@ def test_evaluate_geometry_leaves_a_models_report_alone(capsys, tmp_path):
     assert (model / "report.json").read_text() == '{"stages": []}'
 
 
+@pytest.mark.slow
 def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(200, 3))

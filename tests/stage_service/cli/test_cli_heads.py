@@ -36,6 +36,7 @@ def test_a_head_is_laid_under_points_of_its_scalp(
     assert np.median(off) < 5e-4
 
 
+@pytest.mark.slow
 def test_a_mesh_in_inches_with_y_up_becomes_a_template(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -64,6 +65,7 @@ def egg() -> Mesh:
     return Mesh(points.reshape(-1, 3), faces)
 
 
+@pytest.mark.slow
 def test_a_mesh_whose_face_cannot_be_told_is_warned_of(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -208,6 +208,7 @@ def test_priorities_retries_and_time_outs(tmp_path):
         queue.close()
 
 
+@pytest.mark.slow
 def test_what_renders_waits_for_a_gpu_where_the_service_says_so(tmp_path):
     queue = JobQueue(tmp_path, gpu_workers=True)
     for name in ("fit", "reconstruct"):
