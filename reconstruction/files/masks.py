@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -18,6 +20,8 @@ _COLOUR_TYPE = 25  # where a PNG says what its pixels are
 _MAYBE_TRANSPARENT = (3, 4, 6)  # a palette, grey or colour with alpha
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION
 """Cameras are those of the pixels as a file has them: EXIF says how viewers turn them."""
+_PIECE = 4096  # packed bytes that are unpacked at a time: to 4 MB at most
+_WIDEST = 8  # bytes of a pixel: four channels of 16 bits
 ALIKE = 0.9
 """Of the pixels of either that are of both, where two masks are one: soft edges differ."""
 
@@ -44,9 +48,14 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
         raise ValueError(f"{expected}, got another file")
     if (found := _SIZE.unpack_from(data, 16)) != (width, height):
         raise ValueError(f"{expected}, got {found[0]}x{found[1]}")
-    end = 8
+    end, packed = 8, list[memoryview]()
     while end + _LENGTH.size <= len(data):
-        end += 12 + _LENGTH.unpack_from(data, end)[0]  # a chunk's own three words, and its data
+        length = _LENGTH.unpack_from(data, end)[0]
+        if data[end + 4 : end + 8] == b"IDAT":
+            packed.append(memoryview(data)[end + 8 : end + 8 + length])
+        end += 12 + length  # a chunk's own three words, and its data
+    if end <= len(data) and _exceeds(packed, 2 * height * (width * _WIDEST + 1)):
+        raise ValueError(f"{expected}, got one with more data than so many pixels have")
     image: NDArray[np.uint8] | None = None
     if end <= len(data):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), AS_STORED | cv2.IMREAD_GRAYSCALE)
@@ -56,6 +65,20 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
     if data[_COLOUR_TYPE] in _MAYBE_TRANSPARENT:
         check_alpha(data, mask)
     return mask
+
+
+def _exceeds(packed: Iterable[memoryview], most: int) -> bool:
+    """Whether a zlib stream, in parts, unpacks to more than `most` bytes; holds few of them."""
+    stream = zlib.decompressobj()
+    for part in packed:
+        for begin in range(0, len(part), _PIECE):
+            try:
+                most -= len(stream.decompress(part[begin : begin + _PIECE]))
+            except zlib.error:
+                return False  # the reader says what is wrong with it
+            if most < 0 or stream.eof:
+                return most < 0
+    return False
 
 
 def half_grey(image: NDArray[np.uint8]) -> Bools:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
+
+import bombs
 import cv2
 import numpy as np
 import pytest
@@ -43,6 +46,17 @@ def test_a_mask_in_alpha_alone_is_not_taken_for_one_of_all_pixels(kind):
     image[..., 3] = white
     opaque = decode_mask(bytes(cv2.imencode(".png", image)[1]), 3, 2)
     assert opaque.tolist() == same.tolist()
+
+
+def test_a_file_that_unpacks_to_more_than_its_pixels_is_refused():
+    data = zlib.compress(bytes(256 << 20), 1)
+    parts = [data[:1000], data[1000:]]
+    for split in ([data], parts):
+        more = b"".join(bombs.chunk(b"IDAT", part) for part in split[:-1])
+        with pytest.raises(ValueError, match="more data than so many pixels have"):
+            decode_mask(bombs.png(640, 480, more=more, data=split[-1]), 640, 480)
+    many = bombs.chunk(b"tEXt", b"k\0" + bytes(1 << 20))
+    assert not decode_mask(bombs.png(640, 480, more=many), 640, 480).any()
 
 
 def test_what_a_file_says_of_its_sizes_is_not_believed(png, monkeypatch):
