@@ -1,10 +1,10 @@
-"""Ground floor: calibrated geometry, capture folders, and strands from images.
+"""Calibrated geometry, capture folders, and strands from images.
 
     from reconstruction import Capture, Model, reconstruct
 
     reconstruct(Capture("captures/wig"), Model("models/wig"))
 
-Public names are imported when they are first asked for; `__init__.pyi` lists them.
+Public names are imported lazily; `__init__.pyi` lists them.
 """
 
 import lazy_loader

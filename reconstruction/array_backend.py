@@ -1,4 +1,4 @@
-"""One place that chooses Dr.Jit's back end and hands it NumPy's arrays."""
+"""The choice of Dr.Jit's back end, and NumPy arrays for it."""
 
 from __future__ import annotations
 
@@ -19,28 +19,25 @@ _PACKET = 256  # bytes: no vector of any back end is longer
 
 
 def chosen_variant(variant: str | None = None) -> str:
-    """The variant to run: `variant`, else `HAIRSTAGE_VARIANT`, else LLVM, which every CPU runs.
+    """The variant to run: `variant`, else `HAIRSTAGE_VARIANT`, else LLVM.
 
-    Named as Mitsuba's are, such as `llvm_ad_rgb` or `cuda_ad_rgb`. Makes libLLVM known to Dr.Jit
-    where it is needed; raises `BackendError` when it is too old or absent, or without a GPU.
+    Mitsuba's names, such as `llvm_ad_rgb` or `cuda_ad_rgb`. Raises `BackendError` if libLLVM is too
+    old or missing, or without a GPU.
     """
     chosen = variant or os.environ.get(VARIANT) or "llvm_ad_rgb"
     if chosen.startswith("llvm"):
         os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
     if chosen.startswith("cuda") and not drjit.has_backend(drjit.JitBackend.CUDA):
         raise BackendError(
-            f"{chosen} needs an NVIDIA GPU with its driver, and none is found: leave {VARIANT} "
-            "unset to run on the CPU"
+            f"{chosen} needs an NVIDIA GPU with its driver, and none was found: unset {VARIANT} to "
+            "run on the CPU"
         )
     return chosen
 
 
 def prefer_cuda() -> bool:
-    """Whether this process runs on a GPU: it does where there is one and nothing else was chosen.
-
-    `HAIRSTAGE_VARIANT` comes first; where it says nothing and there is a CUDA device, it says CUDA
-    from now on.
-    """
+    """Whether this process runs on a GPU; sets `HAIRSTAGE_VARIANT` to CUDA if it is unset and there
+    is a CUDA device."""
     if not os.environ.get(VARIANT) and drjit.has_backend(drjit.JitBackend.CUDA):
         os.environ[VARIANT] = "cuda_ad_rgb"
     return os.environ.get(VARIANT, "").startswith("cuda")
@@ -54,18 +51,15 @@ def array_types(variant: str | None = None) -> Any:
     if chosen.startswith("llvm"):
         return drjit.llvm
     raise BackendError(
-        f"the variant {chosen!r} has no arrays to compute with: choose llvm_* or cuda_* in "
-        "HAIRSTAGE_VARIANT"
+        f"unsupported variant {chosen!r}: choose llvm_* or cuda_* in HAIRSTAGE_VARIANT"
     )
 
 
 def for_kernels(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any]:
-    """A copy of `values`, of the same shape, that may be handed to a Dr.Jit array type.
+    """A copy of `values`, of the same shape, as input of a Dr.Jit array type.
 
-    Dr.Jit reads NumPy's memory in place, and its LLVM kernels read the last packet of lanes whole:
-    up to 60 bytes past the end of float32, which ends the process where the next page is not
-    mapped. They are also compiled anew for memory that does not begin at a packet. The copy begins
-    at one, and has room for one after its end.
+    Aligned to a packet, with room for another at the end: LLVM kernels read NumPy's memory in
+    place, up to 60 bytes past its end, and are compiled anew for other alignments.
     """
     values = np.asarray(values)
     size = values.size * np.dtype(dtype).itemsize
@@ -79,7 +73,7 @@ def for_kernels(values: ArrayLike, dtype: DTypeLike = np.float32) -> NDArray[Any
 def rows_of(value: Any) -> NDArray[Any]:
     """The lanes of a Dr.Jit variable as rows: `(N,)` of a number, `(N, c)` of a vector.
 
-    NumPy's own way to a vector, by `np.array`, compiles a kernel for each number of lanes.
+    `np.array` of a vector would compile a kernel for each number of lanes.
     """
     drjit.eval(value)
     if drjit.depth_v(value) < 2:

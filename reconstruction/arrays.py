@@ -1,4 +1,4 @@
-"""The array types of the house; shapes stand in docstrings, as `(N, 3)`."""
+"""Array types; docstrings give the shapes, as `(N, 3)`."""
 
 from __future__ import annotations
 

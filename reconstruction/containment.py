@@ -1,7 +1,4 @@
-"""Paths and names that others chose: in a request, or in a file that anybody may have written.
-
-Whoever joins such a name to a folder, or opens such a path, asks here first.
-"""
+"""Checks of untrusted paths and names before they are joined or opened."""
 
 from __future__ import annotations
 
@@ -13,18 +10,19 @@ MOST_BYTES = 256 << 20
 
 
 class NotContained(ValueError):
-    """A path or name that leads elsewhere, or to what is no plain file."""
+    """A path or name outside the folder, or of no regular file."""
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`, which need not be there yet. Raises `NotContained`.
+    """`folder / name`, which need not exist.
 
-    Refused is what lies elsewhere once ".." and links are followed, and what no file can be called.
+    Raises `NotContained` for a path outside of `folder` once ".." and links are resolved, and for
+    an invalid one.
     """
     try:
         path = folder / name
         root, real = folder.resolve(), path.resolve()
-        path.exists()  # complains where no file can be called so
+        path.exists()  # raises for an invalid name
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise NotContained(f"{str(name)[:LONGEST_NAME]!r} is no path: {error}") from error
     if real == root or not real.is_relative_to(root):
@@ -33,16 +31,16 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def is_file_name(name: object) -> bool:
-    """Whether this can be (part of) a file's name: a camera's, say, whose frames are `NAME.exr`."""
+    """Whether this can be (part of) a file's name, as a camera's, whose frames are `NAME.exr`."""
     if not isinstance(name, str) or not 1 <= len(name) <= LONGEST_NAME or name[0] == ".":
         return False
     return name.isprintable() and not set(name) & set("/\\")
 
 
 def plain_file(path: str | Path, most: int = MOST_BYTES) -> Path:
-    """`path`, where it is a file of at most `most` bytes. Raises `NotContained`, `OSError`.
+    """`path`, if it is a regular file of at most `most` bytes. Raises `NotContained`, `OSError`.
 
-    A pipe or a device could be read for ever; neither is opened to find out.
+    Nothing is opened: reading a pipe or a device may block.
     """
     path = Path(path)
     found = path.stat()

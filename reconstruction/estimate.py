@@ -1,8 +1,7 @@
-"""What `reconstruct` will cost, told from a short probe of this capture on this machine.
+"""The cost of `reconstruct`, estimated from a short probe of the capture on this machine.
 
-What large captures spend their time on is run: frames are read, rows of a sweep searched, a filter
-bank applied, each a few times and multiplied. What follows from the hair alone (growth, refinement)
-is a table of seconds per unit, scaled by how fast this machine is at a known task.
+Reading frames, searching rows of a sweep and filter banks are timed on samples; stages that depend
+on the hair alone come from a table of seconds per unit, scaled by the time of a reference task.
 """
 
 from __future__ import annotations
@@ -27,36 +26,33 @@ from reconstruction.light_codes.line_strands import MOST_LINES
 from reconstruction.light_codes.search import STEP_PIXELS
 from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
-from reconstruction.pipeline import FINE_PIXEL, method_for, without
+from reconstruction.pipeline import FINE_PIXEL, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent
+from reconstruction.stages import method_for
 from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
 
 KNOWN_TASK = 0.0155
-"""Seconds that the known task takes on the machine of the table: a filter bank on 256² pixels."""
+"""Seconds of the reference task, a filter bank on 256² pixels, on the machine of the table."""
 
 SWEPT, UNSWEPT = 2.0, 8.0
-"""Cells of `MeasureOptions.thin` that a surface is deep: triangulated, and where hulls put it."""
+"""Depth of a surface in cells of `MeasureOptions.thin`: triangulated, and on a hull."""
 
 DEPTHS = 1.6e-6
-"""Seconds that line stereo takes for a pixel and a neighbour on two cores; all share it evenly.
+"""Seconds of line stereo per pixel and neighbour on two cores, of which three fifths scale with the
+number of depths, 0.5 mm apart."""
 
-Depths are 0.5 mm apart; three fifths of it are theirs.
-"""
-
-HEAD_FIT = 2.0  # seconds: points are thinned to about as many, whatever the capture
+HEAD_FIT = 2.0  # seconds, whatever the capture: points are thinned
 ROWS = 12  # of a sweep that the probe searches, in each of three places
-LOOKS = 96  # lights that hair is told from skin by: up to twice as many are read
+SKIN_LIGHTS = 96  # lights to classify hair and skin: up to twice as many are read
 GB = 1e9
 
 
 @dataclass(frozen=True)
 class StageCost:
-    """What a stage is expected to take: `seconds`, the process's `peak_gb` meanwhile.
-
-    Of the seconds the probe has measured the share `measured` here; the rest is the table's.
-    """
+    """Expected `seconds` of a stage, of which the share `measured` is the probe's and the rest the
+    table's, and the process's `peak_gb`."""
 
     name: str
     seconds: float
@@ -66,10 +62,8 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a whole reconstruction: `stages` in order, the `frames` read, the `disk_gb` written.
-
-    `working_gb` more are on the disk meanwhile: frames of a reduced view.
-    """
+    """Cost of a reconstruction: `stages` in order, `frames` read, `disk_gb` written, `working_gb`
+    of temporary files."""
 
     method: Method
     stages: tuple[StageCost, ...]
@@ -84,7 +78,7 @@ class Estimate:
 
     @property
     def peak_gb(self) -> float:
-        """Of the stage that takes most."""
+        """Largest of all stages."""
         return max(s.peak_gb for s in self.stages)
 
 
@@ -95,11 +89,10 @@ def estimate(
     options: ReconstructOptions = ReconstructOptions(),
     progress: Progress = silent,
 ) -> Estimate:
-    """What `reconstruct(capture, model, method=method, options=options)` will take on this machine.
+    """Cost of `reconstruct(capture, model, method=method, options=options)` on this idle machine.
 
-    `hairstage bench large` shows how far off it is. Where other work keeps the machine busy it
-    takes longer. Raises `CaptureError` where a frame that the probe reads cannot be read, and for
-    held-out cameras what `reconstruct` raises.
+    `hairstage bench large` shows its error. Raises `CaptureError` for an unreadable frame, and for
+    held-out cameras as `reconstruct` does.
     """
     capture = capture.view(undistorted=True)
     probe = _Probe(without(capture, options.held_out), options, progress)
@@ -114,7 +107,7 @@ def estimate(
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """Measures what a capture costs; all sizes are those of the pictures as they are worked on."""
+    """Measures the cost of a capture; sizes are those of the images that are processed."""
 
     capture: Capture
     options: ReconstructOptions
@@ -140,14 +133,14 @@ class _Probe:
 
     @cached_property
     def slowness(self) -> float:
-        """How many times as long as the table's machine this one takes."""
+        """Run time on this machine over that on the table's."""
         image = np.random.default_rng(0).random((256, 256), np.float32)
         bank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
         responses(bank, image)  # makes its filters
         return _seconds(lambda: responses(bank, image), 3) / KNOWN_TASK
 
     def frames(self, *kinds: StepKind) -> int:
-        """How many frames of these kinds there are, of all cameras."""
+        """Number of frames of these kinds, of all cameras."""
         steps = [s for k in kinds for s in self.capture.of_kind(k)]
         return sum(self.capture.has(s, c.name) for s in steps for c in self.cameras)
 
@@ -162,7 +155,7 @@ class _Probe:
         raise MissingFrame(f"{self.capture.path}: no frame of the kind {kind}")
 
     def reading(self, kind: StepKind) -> float:
-        """Seconds that one frame of that kind takes to be read, after others of its camera."""
+        """Seconds to read a frame of that kind, after others of its camera."""
         total = 0.0
         for number in range(2):
             _, camera = self.a_frame(kind, number)
@@ -174,19 +167,19 @@ class _Probe:
 
     @cached_property
     def read(self) -> float:
-        """Seconds that a frame under a single light takes to be read, 0 where there is none."""
+        """Seconds to read a frame under a single light, 0 without any."""
         self.progress("reading frames", 0.1)
         return self.reading("olat") if self.frames("olat") else 0.0
 
     @property
     def again(self) -> float:
-        """Seconds that it takes to be read once more: a reduced view keeps its own."""
+        """Seconds to read it once more: a reduced view caches its frames."""
         return self.read if self.capture.reduced_by == 1 else 2e-8 * self.pixels
 
     @cached_property
     def hair(self) -> float:
-        """Pixels of all cameras that show the subject or, where that is known, its hair."""
-        self.progress("looking for the subject", 0.0)
+        """Pixels of all cameras on the hair, by its masks, or else on the subject."""
+        self.progress("finding the subject", 0.0)
         shares = []
         for camera in self.cameras[:: max(1, len(self.cameras) // 4)]:
             if (mask := self.capture.mask(camera.name)) is not None:
@@ -212,24 +205,24 @@ class _Probe:
 
     @cached_property
     def points(self) -> float:
-        """Where directions are measured: one for two pixels, until the surface is full of them."""
-        sphere = 4 * self.hair / len(self.cameras) * self.pixel**2  # of as large an outline
+        """Points with measured directions: one per two pixels, until the surface is saturated."""
+        sphere = 4 * self.hair / len(self.cameras) * self.pixel**2  # of the same outline
         deep = SWEPT if self.capture.of_kind("scanline") else UNSWEPT
         most = deep * sphere / self.options.measure.thin**2
         return most * (1 - float(np.exp(-0.7 * self.hair / most)))
 
     @cached_property
     def volume(self) -> float:
-        """Voxels that can hold hair, millions: the ball of the outline, of a sweep its shell."""
+        """Millions of voxels of the envelope: a ball of the outline, its shell for a sweep."""
         share = 0.3 if self.capture.of_kind("scanline") else 1.0
         outline = self.hair / len(self.cameras) * self.pixel**2
         return share * 0.75e-6 * outline**1.5 / self.options.grid**3
 
-    def stages(self, asked: Method) -> list[StageCost]:
-        """The stages in the order of the report, also those that find nothing to do."""
-        method = method_for(self.capture) if asked == "auto" else asked
+    def stages(self, requested: Method) -> list[StageCost]:
+        """The stages in the order of the report."""
+        method = method_for(self.capture) if requested == "auto" else requested
         slow, n, hair, lights = self.slowness, self.points, self.hair, self.lights
-        base = 0.3  # that the process has, and what of a sweep's points it keeps
+        base = 0.3  # of the process, later with a sweep's points
         out: list[StageCost] = []
 
         def add(name: str, measured: float = 0.0, table: float = 0.0, gb: float = 0.0) -> None:
@@ -248,7 +241,7 @@ class _Probe:
         if points is not None:
             add("head", table=HEAD_FIT)
             known = True
-        if asked == "auto":
+        if requested == "auto":
             add("method")
         sweep = self.frames("scanline")
         rows, stripes = 0.0, 0.0
@@ -261,14 +254,14 @@ class _Probe:
             each = 0.02 + 6e-6 * min(hair / len(self.cameras), 12_000.0)
             add("motion", read, tracking * each, (300 * self.pixels + 560 * hair) / GB)
             base += 560 * hair / GB
-        looked = min(lights, 1.5 * LOOKS) * len(self.cameras)
+        looked = min(lights, 1.5 * SKIN_LIGHTS) * len(self.cameras)
         lit = len(self.cameras) if self.frames("all_on") else self.frames("olat")
         more = looked + (0 if known else lit)
         add(
             "masks",
             lit * self.read + more * (self.read if self.frames("all_on") else self.again),
             looked * 1.7e-7 * self.pixels,
-            (8 * min(lights, 1.5 * LOOKS) / len(self.cameras) + 40) * hair / GB,
+            (8 * min(lights, 1.5 * SKIN_LIGHTS) / len(self.cameras) + 40) * hair / GB,
         )
         if method in ("photometric", "lmvs"):
             _, lines = self._line_stereo(add, method)
@@ -279,18 +272,18 @@ class _Probe:
         elif not known and lights >= FEWEST_LIGHTS_OF_SKIN:
             add("head", 3 * min(lights, MOST_LIGHTS) * self.again, HEAD_FIT)
         volume = self.volume
-        bare = not known and method == "hull"  # nothing but a hull, filled 12 mm deep
+        bare = not known and method == "hull"  # a hull without a head, filled 12 mm deep
         each = 0.1 if bare else 0.5
         add("envelope", table=2 + each * len(self.cameras) * volume, gb=0.3 * volume)
         if lights:
             self._orientation(add)
         found, lines = 0.0, 0.0
         if method == "hull":
-            sees = lights > 0 and self.pixel <= FINE_PIXEL
+            fine = lights > 0 and self.pixel <= FINE_PIXEL
             place = len(out)
-            if sees:
+            if fine:
                 found, lines = self._line_stereo(add, method)
-            add("line stereo", table=2e-5 * lines, gb=5e-7 * hair if sees else 0.0)
+            add("line stereo", table=2e-5 * lines, gb=5e-7 * hair if fine else 0.0)
             out.insert(place, out.pop())
         else:
             add("surface", table=2.8e-9 * n * n if sweep else 0.0, gb=8e-6 * n if sweep else 0.0)
@@ -321,14 +314,14 @@ class _Probe:
         images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
         scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
-        part = 0.35e9 * min(n / 2e4, 1.0)  # of scores, as they are decided
+        part = 0.35e9 * min(n / 2e4, 1.0)  # of scores being decided
         times = 4 if reads else 2.4
         add("orientation", measured, table, max(images, times * scores + part + observed) / GB)
 
     def _line_stereo(
         self, add: Callable[[str, float, float, float], None], method: Method
     ) -> tuple[float, float]:
-        """Add its stages; returns how many lines views will agree on, and those traced through."""
+        """Add its stages; returns the numbers of agreed segments and of traced lines."""
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
         frames, bank = self.frames("olat"), self.options.light_codes.bank
         measured = frames * (self.again + self.filtering(bank))
@@ -344,7 +337,7 @@ class _Probe:
         words = -(-lights // WORD)  # of a lightcode
         each = DEPTHS * (1 + 0.5 * words) * depths * 2 / (os.cpu_count() or 2)
         add("depth", 0.0, each * hair * near, 2.5e-7 * hair)
-        lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # fewer agree where pixels are wide
+        lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # wide pixels agree less
         if method == "lmvs":
             lines *= 0.03
         found, lines = lines, min(lines, MOST_LINES)
@@ -353,7 +346,7 @@ class _Probe:
         return found, lines
 
     def row(self) -> float:
-        """Seconds that one row of a sweep takes in one camera: of some in three places."""
+        """Seconds of one row of a sweep in one camera, from rows in three places."""
         self.progress("searching rows", 0.3)
         step, camera = self.a_frame("scanline")
         steps = [s for s in self.capture.of_kind("scanline") if s.projector == step.projector]
@@ -370,17 +363,17 @@ class _Probe:
         return _seconds(searched) / sum(map(len, some))
 
     def filtering(self, bank: LogGaborBank) -> float:
-        """Seconds that a filter bank takes on one picture."""
+        """Seconds of a filter bank on one image."""
         self.progress("filtering", 0.6)
         step, camera = self.a_frame("olat")
         image = self.capture.frame(step, camera).mean(axis=-1)
-        few = replace(bank, count=min(bank.count, 8))  # a few of them: large pictures take minutes
+        few = replace(bank, count=min(bank.count, 8))  # large images take minutes
         _ = responses(few, image)
         return _seconds(lambda: responses(few, image)) * bank.count / few.count
 
 
 def _seconds(task: Callable[[], object], times: int = 1) -> float:
-    """The least that `task` takes, of `times` runs."""
+    """The least seconds of `times` runs of `task`."""
     best = np.inf
     for _ in range(times):
         start = time.perf_counter()

@@ -1,7 +1,6 @@
-"""Finds libLLVM and names it to Dr.Jit, which loads it as it is imported: import this before.
+"""Finds libLLVM for Dr.Jit, which loads it on import: import this module before.
 
-The import raises `BackendError` where libatomic is missing, without which Mitsuba's wheel cannot
-be imported.
+The import raises `BackendError` if libatomic, which Mitsuba's wheel needs, is missing.
 """
 
 from __future__ import annotations
@@ -18,14 +17,13 @@ _FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/lib")
 
 
 class BackendError(RuntimeError):
-    """No back end can run here; the message says what to install."""
+    """No back end can run; the message names what to install."""
 
 
 def find_libllvm() -> str:
-    """Path of the newest libLLVM of version 16 or newer.
+    """Path of the newest libLLVM of version 16 or newer, or of `DRJIT_LIBLLVM_PATH`.
 
-    `DRJIT_LIBLLVM_PATH` wins when it is set. Dr.Jit 1.5 aborts the process on LLVM 15, so an older
-    library is an error here. Raises `BackendError`.
+    Raises `BackendError` for older ones, on which Dr.Jit 1.5 aborts the process.
     """
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     candidates = [Path(named)] if named else _installed()
@@ -33,9 +31,9 @@ def find_libllvm() -> str:
     for version, path in found:
         if version >= OLDEST_LLVM and _loads(path):
             return path
-    seen = f"found only {', '.join(f'{p} (LLVM {v})' for v, p in found)}" if found else "found none"
+    what = f"found only {', '.join(f'{p} (LLVM {v})' for v, p in found)}" if found else "found none"
     raise BackendError(
-        f"hairstage needs libLLVM {OLDEST_LLVM} or newer and {seen}: "
+        f"hairstage needs libLLVM {OLDEST_LLVM} or newer and {what}: "
         "run 'apt-get install libllvm19' (or set DRJIT_LIBLLVM_PATH to the library)"
     )
 
@@ -61,7 +59,7 @@ def _loads(path: str) -> bool:
     return True
 
 
-with suppress(BackendError):  # whoever asks for a back end that needs it is told
+with suppress(BackendError):  # raised again when a back end needs it
     os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
 
 if sys.platform == "linux" and not _loads("libatomic.so.1"):

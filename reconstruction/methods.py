@@ -1,9 +1,10 @@
-"""The names of the reconstruction's methods, for whoever only passes them on."""
+"""The names of the reconstruction's methods."""
 
 from typing import Literal, get_args
 
 Method = Literal["auto", "light_planes", "photometric", "lmvs", "fused", "hull"]
-"""Planes of light (Photobooth), lightcodes (Sun 2021), the baseline without (Nam 2019), or both;
-the hull's smooth field, pulled by what is measured; what the capture holds decides."""
+"""`light_planes` (Photobooth), `photometric` (lightcodes, Sun 2021), `lmvs` (Nam 2019), `fused`
+(light planes and lightcodes), `hull` (smooth field of the visual hull); `auto` chooses by the
+capture."""
 
 METHODS: tuple[str, ...] = get_args(Method)

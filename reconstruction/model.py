@@ -1,7 +1,6 @@
-"""A model: the folder in which everything that is made of one capture comes to lie.
+"""A model: the folder with all results from one capture, and the only code that joins its paths.
 
-Nobody else joins a path to a model folder. Every file is written under a temporary name, flushed
-and renamed: after a crash it is the old one or the new one, whole.
+Files are written durably: after a crash each is the old one or the new one.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from reconstruction.report.report import Report
 MaskKind = Literal["hair", "skin"]
 
 FILES = {
-    "index.html": "one page on the model: begin here",
+    "index.html": "one page on the model: start here",
     "strands.npz": "the strands, roots first (also .hair and .usdc)",
     "strands.hair": "the strands for cyHair's readers",
     "strands.usdc": "the strands as USD curves",
@@ -55,7 +54,7 @@ FILES = {
     "results.json": "the job's figures in one object",
     "progress.json": "the current stage of a running job",
 }
-"""What a model folder may hold, by its place in it. Checkpoints are there while a fit runs."""
+"""The files of a model folder, without the checkpoints of a running fit."""
 
 
 _OF_APPEARANCE = (
@@ -78,11 +77,11 @@ _RECONSTRUCT = "hairstage reconstruct CAPTURE --out"
 
 
 class ModelError(ValueError):
-    """A model that lacks what was asked for; the message names the file and what to do."""
+    """A missing or damaged file of a model; the message names the file and the command to run."""
 
 
 class Model:
-    """A model folder. It need not be there yet: `create` makes it."""
+    """A model folder, which may not exist yet: see `create`."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -91,22 +90,22 @@ class Model:
         return str(self.path)
 
     def create(self) -> Model:
-        """Make the folder where it is not there; returns the model."""
+        """Create the folder if needed; returns the model."""
         (self.path / "masks").mkdir(parents=True, exist_ok=True)
         return self
 
     def file(self, name: str) -> Path:
-        """The path of one of `FILES`, or of what lies under one that is a folder."""
+        """The path of one of `FILES`, or of a file in one that is a folder."""
         if name.split("/")[0] not in FILES:
             raise KeyError(f"a model has no file {name!r}; there are {', '.join(FILES)}")
         return self.path / name
 
     def has(self, name: str) -> bool:
-        """Whether the file is there."""
+        """Whether the file exists."""
         return self.file(name).exists()
 
     def remove(self, name: str) -> None:
-        """Remove a file, or a folder of files, where it is there."""
+        """Remove a file, or a folder of files, if it exists."""
         path = self.file(name)
         if path.is_dir():
             shutil.rmtree(path)
@@ -114,7 +113,7 @@ class Model:
             path.unlink(missing_ok=True)
 
     def forget_appearance(self) -> None:
-        """Remove every fit to the strands, and the pictures and figures of it."""
+        """Remove every fit to the strands, with its images and figures."""
         for name in _OF_APPEARANCE:
             self.remove(name)
 
@@ -127,7 +126,7 @@ class Model:
             yield temporary
 
     def artifacts(self) -> dict[str, Path]:
-        """The files that are whole, by their names relative to the folder, in order."""
+        """The complete files by their names relative to the folder, in order."""
         root = self.path.resolve()
         return {
             p.relative_to(root).as_posix(): p
@@ -136,7 +135,7 @@ class Model:
         }
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of `artifacts` by their names; what a job removes meanwhile is none of them."""
+        """Bytes of `artifacts` by their names, without those that a job removes meanwhile."""
         sizes = {}
         for name, path in self.artifacts().items():
             with suppress(FileNotFoundError):
@@ -144,18 +143,18 @@ class Model:
         return sizes
 
     def strands(self) -> Strands:
-        """The strands. Raises `ModelError` where there are none yet."""
+        """The strands. Raises `ModelError` without any."""
         return read_strands(self._needed("strands.npz", _RECONSTRUCT))
 
     def write_strands(self, strands: Strands) -> None:
-        """Write the strands in all three formats; what was made of others is removed first."""
+        """Write the strands in all three formats, after removing results from earlier ones."""
         self.forget_appearance()
         self.remove("scalp_map.npz")
         for suffix in ("npz", "hair", "usdc"):
             write_strands(self.file(f"strands.{suffix}"), strands)
 
     def points(self) -> PointCloud:
-        """The triangulated points; none where there was no sweep."""
+        """The triangulated points; empty without a sweep."""
         return PointCloud.load(self._needed("points.npz", _RECONSTRUCT))
 
     def write_points(self, points: PointCloud) -> None:
@@ -163,22 +162,21 @@ class Model:
         points.save(self.file("points.npz"))
 
     def head(self, capture: Capture | None) -> Mesh | None:
-        """The head that later steps use: the one laid under points, else the capture's."""
+        """The head that later steps use: the fitted one, else the capture's."""
         if self.has("head.obj"):
             return read_obj(self.file("head.obj"))
         return capture.head if capture is not None else None
 
     def write_head(self, head: Mesh) -> None:
-        """Write the head that was laid under points."""
+        """Write the fitted head."""
         with self.writing("head.obj") as temporary:
             write_obj(temporary, head)
 
     def mask(self, camera: str, kind: MaskKind, capture: Capture) -> Bools:
         """The mask `(H, W)` of `camera`, in the pixels of `capture`'s frames.
 
-        A hair mask that is absent falls back to the user's in the capture, an absent skin mask to
-        an empty one. Raises `CaptureError` for a mask of another size, `ModelError` where there is
-        no hair mask at all.
+        A missing hair mask falls back to the user's in the capture, a missing skin mask to an empty
+        one. Raises `CaptureError` for a mask of another size, `ModelError` without a hair mask.
         """
         name = f"masks/{camera}_{kind}.png"
         if not self.has(name):
@@ -195,13 +193,13 @@ class Model:
         self.write_png(f"masks/{camera}_{kind}.png", mask.astype(np.uint8) * 255)
 
     def write_png(self, name: str, image: NDArray[np.uint8]) -> None:
-        """Write a grey `(H, W)` or BGR `(H, W, 3)` picture."""
+        """Write a grey `(H, W)` or BGR `(H, W, 3)` image."""
         with self.writing(name) as temporary:
             if not cv2.imwrite(str(temporary), image):
                 raise OSError(f"{self.file(name)}: OpenCV could not write it")
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        """The arrays of an `.npz` file by name; `ModelError` where it is not there, or damaged."""
+        """The arrays of an `.npz` file by name; `ModelError` if it is missing or damaged."""
         file = self._needed(name, "hairstage fit CAPTURE")
         try:
             return read_arrays(file)
@@ -214,7 +212,7 @@ class Model:
             np.savez_compressed(temporary, allow_pickle=False, **arrays)
 
     def root_uv(self, strands: Strands) -> Array | None:
-        """(u, v) of each strand's root on the scalp's map `(S, 2)`; None where there is no map."""
+        """(u, v) of each strand's root on the scalp's map `(S, 2)`; None without a map."""
         if not self.has("scalp_map.npz"):
             return None
         try:
@@ -224,7 +222,7 @@ class Model:
         return np.clip(roots, 0, 1) if len(roots) == len(strands) else None
 
     def json(self, name: str) -> Any:
-        """A JSON file. Raises `ModelError` where it is not there or not JSON."""
+        """A JSON file. Raises `ModelError` if it is missing or not JSON."""
         try:
             return read_json(self._needed(name, "hairstage fit CAPTURE"))
         except ModelError:
@@ -233,12 +231,12 @@ class Model:
             raise ModelError(str(error)) from error
 
     def write_json(self, name: str, data: Any, *, durable: bool = True) -> None:
-        """Write JSON; numbers that are not finite are an error, never NaN."""
+        """Write JSON; numbers that are not finite are an error."""
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.file(name), data, durable=durable)
 
     def report(self) -> Report:
-        """The report of what was done so far; an empty one where nothing was."""
+        """The report of all stages so far, empty without any."""
         return Report.load(self.file("report.json"))
 
     def write_report(self, report: Report) -> None:
@@ -246,19 +244,19 @@ class Model:
         self.write_json("report.json", report.to_dict())
 
     def checkpoint(self, variant: str) -> Path:
-        """Where a fit of this variant keeps its state while it runs."""
+        """The state of a running fit of this variant."""
         return self.path / f"inverse_rendering-{variant}.checkpoint.npz"
 
     def work(self, name: str) -> Path:
-        """Where a step of this name keeps what it can make again while it runs."""
+        """Temporary files of the running step of this name."""
         return self.path / "work" / name
 
     def _needed(self, name: str, command: str) -> Path:
         path = self.file(name)
         if not path.exists() and (self.path / "rig.json").exists():
             raise ModelError(
-                f"{self.path} is a capture, no model: run 'hairstage reconstruct {self.path} --out "
-                "MODEL' first"
+                f"{self.path} is a capture, not a model: run 'hairstage reconstruct {self.path} "
+                "--out MODEL' first"
             )
         if not path.exists():
             raise ModelError(f"{path} is missing: run '{command} {self.path}' first")

@@ -1,4 +1,4 @@
-"""Options: frozen dataclasses that pydantic checks where they arrive."""
+"""Options: frozen dataclasses validated by pydantic."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class BadOptions(ValueError):
-    """Options that cannot be used; one sentence for each field that is wrong, with its place."""
+    """Invalid options; one sentence for each invalid field, with its path."""
 
 
 @dataclass_transform(frozen_default=True)
 def options(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass of options.
 
-    Unknown fields, NaN, infinity and values out of the range that a field is annotated with (as
-    `Annotated[float, Field(gt=0)]`) raise pydantic's `ValidationError`, which names the field's
-    place at any depth, also of what is given by position.
+    Unknown fields, NaN, infinity and values outside a field's annotated range (as
+    `Annotated[float, Field(gt=0)]`) raise pydantic's `ValidationError` with the field's path, also
+    for positional arguments.
     """
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
     made: type[T] = dataclass(frozen=True, config=config)(cls)  # type: ignore[assignment]
@@ -40,7 +40,7 @@ def options(cls: type[T]) -> type[T]:
 
 
 def parse_options(kind: type[T], values: Mapping[str, Any], place: str = "options") -> T:
-    """`kind` from JSON-like `values`; raises `BadOptions`, where `place` is what they are of."""
+    """`kind` from JSON-like `values`; raises `BadOptions` with paths below `place`."""
     try:
         return TypeAdapter(kind).validate_python(dict(values))
     except ValidationError as error:
@@ -48,7 +48,7 @@ def parse_options(kind: type[T], values: Mapping[str, Any], place: str = "option
 
 
 def sentence(error: ValidationError, place: str = "") -> str:
-    """Each field that is wrong with its place, below `place`, why, and what was given."""
+    """Path below `place`, reason and value of each invalid field."""
     above = (place,) if place else ()
     return "; ".join(
         f"{'.'.join(map(str, (*above, *e['loc'])))}: {e['msg']}"

@@ -1,4 +1,4 @@
-"""JSON that somebody else may have written, read so that it cannot poison who reads it."""
+"""Safe reading of untrusted JSON."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 from reconstruction.containment import plain_file
 
 DEEPEST = 40
-"""Arrays and objects within each other."""
+"""Levels of nested arrays and objects."""
 _UNFIT = re.compile(r"\\u(?:0000|[dD][89a-fA-F])")
 
 
 def read_json(path: str | Path) -> Any:
-    """What a JSON file holds, as `parse_json`. Raises `OSError`, and `ValueError` naming it."""
+    """The value of a JSON file, as `parse_json`. Raises `OSError`, and `ValueError` naming it."""
     data = plain_file(path).read_bytes()
     try:
         return parse_json(data)
@@ -26,10 +26,10 @@ def read_json(path: str | Path) -> Any:
 
 
 def parse_json(data: bytes | str) -> Any:
-    """A JSON text in UTF-8 as RFC 7493 (I-JSON) restricts it. Raises `ValueError`.
+    """A JSON text in UTF-8 as RFC 7493 (I-JSON) restricts it.
 
-    Without NaN, Infinity or numbers beyond float64, half surrogate pairs and NUL, names that an
-    object has twice, and more than `DEEPEST` levels.
+    Raises `ValueError` for NaN, Infinity and numbers beyond float64, lone surrogates and NUL,
+    duplicate names, and more than `DEEPEST` levels.
     """
     text = data.decode() if isinstance(data, bytes) else data
     try:
@@ -48,7 +48,7 @@ def parse_json(data: bytes | str) -> Any:
 
 
 def printable(text: str) -> str:
-    """`text` with what UTF-8 cannot carry, as in names of files that are not UTF-8, escaped."""
+    """`text` with lone surrogates, as in file names that are not UTF-8, escaped."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

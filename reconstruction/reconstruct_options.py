@@ -1,8 +1,4 @@
-"""Everything that `reconstruct` can be asked for; lengths in metres.
-
-Pure data, checked where it arrives, without what a method needs to run: a service shows and checks
-options without loading NumPy.
-"""
+"""The options of `reconstruct`; lengths in metres. Without NumPy, for a service to check them."""
 
 from __future__ import annotations
 
@@ -31,7 +27,7 @@ class LogGaborBank:
 
 @options
 class MotionOptions:
-    """How the motion is solved, and what the subject does `between` two tracking frames."""
+    """How the motion is solved, and continued `between` two tracking frames."""
 
     method: Literal["direct", "registered"] = "direct"
     between: Literal["interpolate", "hold"] = "interpolate"
@@ -41,11 +37,11 @@ class MotionOptions:
 class MeasureOptions:
     """How tangents are measured.
 
-    The `bank` answers to pictures under groups of neighbouring lights. Scores of a point's
-    directions are averaged over up to `neighbours` within `radius`; where reflections under single
-    lights are read too, which tell more, within `reflection_radius`, theirs `reflection_weight`
-    times those of the texture. Points closer than `thin` are merged first. `tolerance` is how far
-    behind a camera's own depth a point may lie and still count as seen.
+    The filter `bank` is applied to images under groups of neighbouring lights. Scores of a point's
+    directions are averaged over up to `neighbours` within `radius`, or within `reflection_radius`
+    if reflections under single lights are used, whose scores count `reflection_weight` times those
+    of the texture. Points closer than `thin` are merged first. Points up to `tolerance` behind a
+    camera's depth are visible in it.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
@@ -62,18 +58,16 @@ class MeasureOptions:
 class SearchOptions:
     """How line stereo searches depths.
 
-    `step` metres between depths, and 5/3 of a pixel's width at most. Segments are compared in up to
-    `neighbours` nearest visible views. The `candidates` best depths of each pixel by few points go
-    on to all of a segment's; 0 gives them all depths (brute force). The first stage takes every
-    `coarse`th depth; the second also those between a candidate and the next. Every `lattice`th
-    pixel both ways is searched first, the others near what was found around them; 1 searches all of
-    them alike.
+    `step` metres between depths, at most 5/3 of a pixel's width. Segments are compared in up to
+    `neighbours` nearest visible views. The `candidates` best depths of each pixel by few points are
+    compared at all points of a segment; 0 compares all depths (brute force). Every `lattice`th
+    pixel both ways is searched first, the others within the depths around them; 1 searches all
+    pixels alike.
     """
 
     step: Length = 5e-4
     neighbours: Annotated[int, Field(ge=1, le=31)] = 16  # with the reference their bits fill a word
     candidates: Annotated[int, Field(ge=0)] = 4
-    coarse: Count = 1
     lattice: Count = 4
 
 
@@ -81,7 +75,7 @@ class SearchOptions:
 class LightCodeOptions:
     """Options of line stereo (the methods `photometric`, `lmvs` and, in part, `fused`).
 
-    Segments count that at least `least_views` views found alike, their own and two others.
+    Segments need the agreement of `least_views` views, their own included.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=5.0, count=48, spread=1.0)
@@ -91,28 +85,26 @@ class LightCodeOptions:
 
 @options
 class RefineOptions:
-    """How all strands are refined together after growth, in `steps` of Gauss-Newton.
+    """How strands are refined jointly after growth, in `steps` of Gauss-Newton.
 
-    A strand stays that adds at least `worth` a millimetre to what the others explain, where 1 is a
-    measured line of full confidence and a guessed millimetre counts 0.05; 0 keeps every strand.
+    Strands that add less than `marginal_coverage` per millimetre are removed; a measured line of
+    full confidence covers 1, a guessed millimetre 0.05. 0 keeps every strand.
     """
 
     steps: Annotated[int, Field(ge=0, le=20)] = 3
-    worth: Annotated[float, Field(ge=0, le=1)] = 0.03
+    marginal_coverage: Annotated[float, Field(ge=0, le=1)] = 0.03
 
 
 @options
 class ReconstructOptions:
-    """What the reconstruction is asked for.
+    """Options of a reconstruction.
 
-    `held_out` cameras take no part at all. `grid` is the voxels' edge; `roots` strands are grown
-    from the scalp, then gaps are filled. `max_length` is the hair's, which the user knows. `margin`
-    is how far in front of the seen surface the envelope reaches. `scalp_points` is a file of
-    digitised scalp points to fit a head to, where the capture has no `head.obj` or a better one is
-    wanted, and `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled
-    `within` metres of what was measured (None: 3 mm, or two voxels, of a hull 12 mm): give more
-    where pixels are wider. `radius` of the strands; None takes the one that keeps a head of hair's
-    coverage.
+    `held_out` cameras are not used. `grid` is the voxels' edge; `roots` strands are grown from the
+    scalp, then gaps are filled. `max_length` is the hair's. `margin` is the envelope's extent in
+    front of the visible surface. `scalp_points` is a file of digitised scalp points to fit a head
+    to, `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled `within` metres
+    of a measurement (None: 3 mm or two voxels, on a hull 12 mm); give more for wider pixels.
+    `radius` of the strands; None keeps a head of hair's coverage.
     """
 
     held_out: tuple[str, ...] = ()

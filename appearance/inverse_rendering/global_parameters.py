@@ -20,7 +20,7 @@ from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import Raw, slopes
+from appearance.inverse_rendering.unknowns import Raw, derivatives
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
 
@@ -236,7 +236,7 @@ class _System:
 def _changes(raw: Raw, number: Number) -> dict[str, Any]:
     """By how much a number's width changes the renderer's value, to first order."""
     name, i = number
-    slope = slopes(raw)[name]
+    slope = derivatives(raw)[name]
     if name != "sigma_a":
         return {name: float(slope[i]) * WIDE[name]}
     return {name: slope * (np.arange(3) == i) * WIDE[name]}

@@ -14,7 +14,7 @@ import numpy as np
 from appearance.bsdf.lobes import Fibre, evaluate
 from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
-from appearance.render.kept_paths import KeptPaths, Scattering
+from appearance.render.cached_paths import CachedPaths, Scattering
 from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
@@ -34,7 +34,7 @@ class Cells:
     stride: int
 
     @classmethod
-    def of(cls, paths: KeptPaths, mapped: MappedStrands, shape: tuple[int, int, int]) -> Cells:
+    def of(cls, paths: CachedPaths, mapped: MappedStrands, shape: tuple[int, int, int]) -> Cells:
         """As the BSDF looks its tables up: nearest on the scalp, linear along the strand."""
         layers, columns, rows = shape
         u, v = mapped.root_uv[paths.strand].T
@@ -72,7 +72,7 @@ class LinearisedPictures:
 
     def __init__(
         self,
-        paths: KeptPaths,
+        paths: CachedPaths,
         mapped: MappedStrands,
         maps: HairMaps,
         intensities: AnyFloats,

@@ -14,7 +14,7 @@ from appearance.inverse_rendering.linearised import LinearisedPictures
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.unknowns import Raw, decode
 from appearance.observations import Observed
-from appearance.render.kept_paths import KeptPaths, KeptSampling, WeightedPixels, keep_paths
+from appearance.render.cached_paths import CachedPaths, CachedSampling, WeightedPixels, cache_paths
 from appearance.render.olat import render_indirect, render_olat
 from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
@@ -45,7 +45,7 @@ class DirectLight:
 
     mapped: MappedStrands
     patch: Patch
-    paths: KeptPaths
+    paths: CachedPaths
     intensities: AnyFloats
 
     def linearised(self, maps: HairMaps, names: Sequence[str]) -> LinearisedPictures:
@@ -185,8 +185,8 @@ class FitProblem:
         # a light's importance is its effect on a displayed image
         importance = self.scale * np.sqrt(losses.weights(level)).mean(axis=-1)
         wanted = WeightedPixels(pixels, importance)
-        sampling = KeptSampling(max(2, effort.spp), effort.max_depth)
-        paths = keep_paths(scene, camera, lights, wanted, sampling, seed)
+        sampling = CachedSampling(max(2, effort.spp), effort.max_depth)
+        paths = cache_paths(scene, camera, lights, wanted, sampling, seed)
         intensities = light_arrays(lights)[1] * self.scale
         return LinearisedPictures(paths, self.mapped, decode(raw), intensities)
 
@@ -194,7 +194,8 @@ class FitProblem:
         """Paths of one vertex through a patch under `gain (L,)`, a shadow ray to every light."""
         scene, camera, lights, pixels = self._setup(raw, gain, patch)
         wanted = WeightedPixels(pixels, np.ones((len(lights), len(pixels)), np.float32))
-        paths = keep_paths(scene, camera, lights, wanted, KeptSampling(effort.spp, 1, _ALL), seed)
+        sampling = CachedSampling(effort.spp, 1, _ALL)
+        paths = cache_paths(scene, camera, lights, wanted, sampling, seed)
         return DirectLight(self.mapped, patch, paths, light_arrays(lights)[1] * self.scale)
 
     def indirect(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:

@@ -53,7 +53,7 @@ def decode(raw: Raw) -> HairMaps:
     )
 
 
-def slopes(raw: Raw) -> Raw:
+def derivatives(raw: Raw) -> Raw:
     """Derivatives of the maps' absorption, roughnesses and index by their numbers."""
     x = raw["sigma_a"]
     out = {"sigma_a": -2 / BRACKET**2 * np.logaddexp(0, -x) * expit(-x)}

@@ -76,9 +76,9 @@ def aligned(found: Rig, truth: Rig) -> Rig:
     back = (Rigid.from_vector(minimise(numeric(residual), np.zeros(6)).x) @ start).inverse()
     return replace(
         found,
-        cameras=tuple(map(back.seen_by, found.cameras)),
+        cameras=tuple(map(back.in_frame, found.cameras)),
         lights=tuple(x.moved(back.rotation, back.translation) for x in found.lights),
-        projectors=tuple(map(back.seen_by, found.projectors)),
+        projectors=tuple(map(back.in_frame, found.projectors)),
     )
 
 

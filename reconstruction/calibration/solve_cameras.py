@@ -292,7 +292,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
         residuals[name] = CORNER * solution.residual[row : row + count].reshape(-1, 2)
         row += count
     return CameraSolution(
-        cameras=tuple(frame.inverse().seen_by(c) for c in found),
+        cameras=tuple(frame.inverse().in_frame(c) for c in found),
         board_to_world={
             p: frame @ Rigid.from_vector(x[bundle.board_at(k)]) for k, p in enumerate(bundle.poses)
         },

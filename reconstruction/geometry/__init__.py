@@ -1,1 +1,1 @@
-"""Cameras, lights, projectors, rigs, meshes and strands: the shapes that the house shares."""
+"""Cameras, lights, projectors, rigs, meshes and strands."""

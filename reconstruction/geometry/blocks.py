@@ -1,7 +1,6 @@
-"""Pictures made smaller by whole factors: each pixel stands for a block of them.
+"""Images and masks reduced by whole factors; `Camera.reduced` is the camera of the result.
 
-The last rows and columns that fill no block are left out; `Camera.reduced` is the camera of the
-pictures that come out.
+Rows and columns at the end that fill no block are cut off.
 """
 
 from __future__ import annotations
@@ -30,10 +29,7 @@ def block_any(mask: Bools, by: int) -> Bools:
 
 
 def unblocked(mask: Bools, by: int, height: int, width: int) -> Bools:
-    """A `mask` of blocks in the pixels `(height, width)` that these were made of.
-
-    Rows and columns that fill no block are as the last block is.
-    """
+    """A `mask` of blocks at full resolution `(height, width)`; the last block is repeated."""
     rows = np.minimum(np.arange(height) // by, mask.shape[0] - 1)
     columns = np.minimum(np.arange(width) // by, mask.shape[1] - 1)
     return np.asarray(mask[np.ix_(rows, columns)])

@@ -34,7 +34,7 @@ class Pinhole:
     """A calibrated pinhole: `X_local = R @ X_world + t`, x right, y down, z forward.
 
     `K (3, 3)` is in pixels with the centre of the top-left pixel at (0, 0); `R (3, 3)` is a
-    rotation; `t (3,)` is in metres. Cameras look through it, projectors shine through it.
+    rotation; `t (3,)` is in metres.
     """
 
     name: str
@@ -95,8 +95,7 @@ class Pinhole:
     def project(self, points: ArrayLike) -> tuple[Array, Array]:
         """Project world `points (..., 3)` to pixels `(..., 2)` and depths along z `(...)`, metres.
 
-        Points at or behind the pinhole (depth <= 0) get pixels that are not finite numbers' worth
-        of anything: test the depth first.
+        Pixels of points at or behind the pinhole (depth <= 0) have no meaning.
         """
         local = np.asarray(points, float) @ self.R.T + self.t
         z = local[..., 2]
@@ -107,19 +106,19 @@ class Pinhole:
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit world directions `(..., 3)` from the centre through `pixels (..., 2)`."""
-        x, y = self._slopes(np.asarray(pixels, float))
+        x, y = self._normalised(np.asarray(pixels, float))
         local = np.stack([x, y, np.ones_like(x)], axis=-1)
         world = local @ self.R
         return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
 
-    def _slopes(self, pixels: Array) -> tuple[Array, Array]:
-        """Slopes x/z, y/z `(...)` before the lens of `pixels (..., 2)`."""
+    def _normalised(self, pixels: Array) -> tuple[Array, Array]:
+        """Undistorted normalised coordinates x/z, y/z `(...)` of `pixels (..., 2)`."""
         y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
         x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
         return self._before_lens(x, y)
 
     def _through_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Slopes x/z, y/z behind the lens from those before it."""
+        """Distorted normalised coordinates x/z, y/z from undistorted ones."""
         return x, y
 
     def _before_lens(self, x: Array, y: Array) -> tuple[Array, Array]:
@@ -138,14 +137,14 @@ class Pinhole:
         x and y are 0 where a point falls on no pixel; depths are metres along z.
         """
         pixels, depth = self.project(points)
-        seen = (depth > 0) & self.inside(pixels)
-        x, y = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
-        return seen, x, y, depth
+        visible = (depth > 0) & self.inside(pixels)
+        x, y = np.rint(np.where(visible[:, None], pixels, 0)).astype(int).T
+        return visible, x, y, depth
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Self:
-        """The pinhole that a moved subject sees: `x -> rotation (3, 3) @ x + translation (3,)`.
+        """The pinhole from which the unmoved subject looks as the moved one does from here.
 
-        Imaging the moved subject from here equals imaging the unmoved one from the result.
+        The subject moves by `x -> rotation (3, 3) @ x + translation (3,)`.
         """
         Q, d = np.asarray(rotation, float), np.asarray(translation, float)
         return replace(self, R=self.R @ Q, t=self.R @ d + self.t)
@@ -160,12 +159,10 @@ class Pinhole:
 class Camera(Pinhole):
     """A calibrated camera with its lens; see `Pinhole` for the convention.
 
-    `distortion` holds OpenCV's k1, k2, p1, p2, k3 (shorter lists end in zeros): slopes x/z, y/z of
-    radius r become (1 + k1 r² + k2 r⁴ + k3 r⁶) times themselves, plus the tangential terms. What is
-    far outside of the image gets the factor of the image's surroundings: the polynomial must not
-    fold it back into the image. `filter_sigma` is the standard deviation in pixels of a Gaussian
-    that a pixel averages over; 0 is a box of one pixel, as a sensor integrates. Raises
-    `ValueError` where the lens is not invertible over the image.
+    `distortion` holds OpenCV's k1, k2, p1, p2, k3 (shorter lists end in zeros). Beyond 1.1 times
+    the image's radius the factor stays constant, so that the polynomial folds nothing back into
+    the image. `filter_sigma` is the standard deviation in pixels of a pixel's Gaussian filter; 0
+    is a box of one pixel. Raises `ValueError` where the lens is not invertible over the image.
     """
 
     distortion: Array = field(default_factory=lambda: np.zeros(5))
@@ -194,15 +191,12 @@ class Camera(Pinhole):
         return replace(self, distortion=np.zeros(5))
 
     def reduced(self, by: int) -> Camera:
-        """The camera whose pixels are the means over blocks of `by`² of this one's.
-
-        Rows and columns that fill no block are cut off. Raises `ValueError` where no pixel is left.
-        """
+        """The camera of images reduced by `block_means`; `ValueError` where no pixel is left."""
         if by == 1:
             return self
         if by < 1 or min(self.width, self.height) < by:
             raise ValueError(
-                f"{self.name}: pictures of {self.width}x{self.height} pixels cannot be reduced by "
+                f"{self.name}: images of {self.width}x{self.height} pixels cannot be reduced by "
                 f"{by}"
             )
         K = self.K.copy()
@@ -238,7 +232,7 @@ class Camera(Pinhole):
         return 1.1 * float(np.hypot(u, v).max())
 
     def _border(self) -> tuple[Array, Array]:
-        """Slopes behind the lens `(17, 17)` all over the image, its edges included."""
+        """Distorted normalised coordinates `(17, 17)` all over the image, its edges included."""
         column, row = np.meshgrid(
             np.linspace(-0.5, self.width - 0.5, 17), np.linspace(-0.5, self.height - 0.5, 17)
         )
@@ -268,9 +262,9 @@ _NEWTON_STEPS = 8
 
 
 def undistorted(distortion: Iterable[Any], x: Any, y: Any) -> tuple[Any, Any]:
-    """Slopes before the lens from those behind it, by Newton's method; see `Camera.distortion`.
+    """Undistorted normalised coordinates from distorted ones, by Newton's method.
 
-    Takes whatever has arithmetic, such as a renderer's arrays.
+    Works on NumPy's and Dr.Jit's arrays; see `Camera.distortion`.
     """
     u, v = x, y
     for _ in range(_NEWTON_STEPS):
@@ -282,14 +276,14 @@ def undistorted(distortion: Iterable[Any], x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def _bent(k: Iterable[Any], x: Any, y: Any) -> tuple[Any, Any, tuple[Any, Any, Any]]:
-    """Slopes behind the lens, and their (symmetric) derivative: d/dx x, d/dy x, d/dy y."""
+    """Distorted coordinates, and their (symmetric) derivative: d/dx x, d/dy x, d/dy y."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    gradient = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
     a = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     b = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    axx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    axy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    ayy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    axx = radial + gradient * x * x + 2 * p1 * y + 6 * p2 * x
+    axy = gradient * x * y + 2 * p1 * x + 2 * p2 * y
+    ayy = radial + gradient * y * y + 6 * p1 * y + 2 * p2 * x
     return a, b, (axx, axy, ayy)

@@ -13,10 +13,10 @@ _CANDIDATES = 6
 
 
 class ClosestPoint:
-    """Finds closest points of `mesh`: among the faces of its six nearest samples, then exactly.
+    """Finds closest points of `mesh`: exact among the faces of the six nearest samples.
 
-    Samples lie `spacing` metres apart, so a distance is never too small and at most about `spacing`
-    too large, far less where faces are small beside it. `faces (F,) bool` restricts the search.
+    Samples lie `spacing` metres apart: a distance is at most about `spacing` too large. `faces
+    (F,) bool` restricts the search.
     """
 
     def __init__(self, mesh: Mesh, spacing: float, faces: Bools | None = None) -> None:
@@ -52,7 +52,7 @@ def closest_on_triangles(points: Array, corners: Array) -> Array:
     ee, ef, ff = (e * e).sum(-1), (e * f).sum(-1), (f * f).sum(-1)
     ed, fd = (e * d).sum(-1), (f * d).sum(-1)
     area = ee * ff - ef * ef
-    wide = area > 1e-12 * ee * ff  # others are lines: their edges say it all
+    wide = area > 1e-12 * ee * ff  # others are lines
     area = np.where(wide, area, 1.0)
     v, w = (ff * ed - ef * fd) / area, (ee * fd - ef * ed) / area
     inner = np.stack([1 - v - w, v, w], axis=-1)

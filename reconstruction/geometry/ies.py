@@ -26,12 +26,10 @@ def read_ies(
 ) -> LightProfile:
     """The distribution in an LM-63 file of any edition, photometry of type A, B or C.
 
-    In candela or W/sr, multiplied by the file's multiplier, ballast and tilt factors.
-
-    LM-63 knows candela only. Makers of infrared, ultraviolet and single-colour lamps write mW/sr in
-    the same places: `unit` says which it is; without it a label line that names `mW/sr` or
-    milliwatts (such as `[OTHER] values in mW/sr`) does. `tilt_deg` is the lamp's tilt, at which
-    the factor of `TILT=INCLUDE` is taken. Raises `IesError` naming file and line.
+    In candela or W/sr, multiplied by the file's multiplier, ballast and tilt factors. Makers of
+    infrared, ultraviolet and single-colour lamps write mW/sr where LM-63 has candela: give `unit`,
+    or a label line that names `mW/sr` or milliwatts. `tilt_deg` selects the factor of
+    `TILT=INCLUDE`. Raises `IesError` naming file and line.
     """
     if unit not in (None, "cd", "mW/sr"):
         raise ValueError(f"unit must be 'cd' or 'mW/sr', got {unit!r}")
@@ -153,7 +151,7 @@ class _Numbers:
         return int(value)
 
     def end(self) -> None:
-        """Refuse numbers that nothing asked for."""
+        """Refuse numbers after the last expected one."""
         if self._next < len(self._words):
             line, word = self._words[self._next]
             left = len(self._words) - self._next

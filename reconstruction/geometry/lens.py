@@ -1,4 +1,4 @@
-"""A lens that bends lines: pictures and masks with its distortion and without."""
+"""Images and masks with a lens's distortion and without."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Maps = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """One camera `as_shot` and the pinhole, `undistorted`, that its pictures are resampled to.
+    """One camera `as_shot` and the pinhole `undistorted` that its images are resampled to.
 
-    `to_shot` are the places (x, y), each `(H, W)` of the undistorted picture, in the one as shot;
-    `to_undistorted` the other way round.
+    `to_shot` are the coordinates (x, y), each `(H, W)`, of undistorted pixels in the image as shot;
+    `to_undistorted` those of shot pixels in the undistorted image.
     """
 
     as_shot: Camera
@@ -31,8 +31,8 @@ class Lens:
     def of(cls, bent: Camera) -> Lens:
         """The lens of the camera `bent`, as shot.
 
-        The undistorted picture is the largest upright one without a pixel that the shot one lacks.
-        Its scale is that of the shot picture's middle, so that no detail there is lost.
+        The undistorted image is the largest upright one without pixels outside the shot one, at
+        the scale of the shot image's centre.
         """
         pinhole = bent.pinhole()
         x, y = np.arange(bent.width), np.arange(bent.height)
@@ -46,10 +46,10 @@ class Lens:
         return cls(bent, straight, _grid(straight, bent), _grid(bent, straight))
 
     def undistort(self, image: Floats) -> Floats:
-        """A picture `(H, W, C)` as shot, undistorted, by cubic interpolation.
+        """An image `(H, W, C)` as shot, undistorted, by cubic interpolation.
 
-        Beside the last of the light a cubic swings below zero, which would pass for noise: what is
-        below zero stays within the four pixels around it.
+        Negative values are clamped to the least of the four pixels around: a cubic's undershoot at
+        an edge would count as noise.
         """
         x, y = self.to_shot
         image = np.ascontiguousarray(image, dtype=np.float32)
@@ -71,13 +71,13 @@ class Lens:
         return np.asarray(_weight(mask, self.to_undistorted) >= 0.5)
 
     def kept(self) -> float:
-        """The share of the shot picture's pixels that the undistorted one shows."""
+        """The share of the shot image's pixels inside the undistorted one."""
         pixels = np.stack(self.to_undistorted, axis=-1)
         return float(self.undistorted.inside(pixels).mean())
 
 
 def _moved(source: Camera, target: Camera, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
-    """Where pixels of `source` are in the picture of `target`, which stands in the same place."""
+    """Pixels of `source` in the image of `target`, which has the same centre."""
     pixels = np.stack(np.broadcast_arrays(x, y), axis=-1)
     moved, _ = target.project(target.center + source.rays(pixels))
     return moved[..., 0], moved[..., 1]

@@ -1,6 +1,6 @@
-"""Lenses that `Camera` cannot carry: rational, thin-prism, tilted, fisheye, Metashape's own.
+"""Lenses that `Camera` does not model: rational, thin-prism, tilted, fisheye, Metashape's own.
 
-Pictures through them are resampled once, as they are imported: `Lens.of` takes such a camera too.
+Their images are resampled once, on import: `Lens.of` takes such a camera too.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from reconstruction.geometry.cameras import Camera
 
 Kind = Literal["opencv", "fisheye", "metashape"]
 COUNTS: dict[Kind, int] = {"opencv": 14, "fisheye": 4, "metashape": 8}
-WIDEST = 5.0  # slope before the lens: beyond 79 degrees off the axis no pinhole shows a picture
+WIDEST = 5.0  # x/z: beyond 79 degrees off the axis no pinhole image is usable
 _STEPS = 30
 
 
 @dataclass(frozen=True, eq=False)
 class LensModel:
-    """How a lens bends slopes x/z, y/z; missing coefficients are 0.
+    """How a lens distorts normalised coordinates x/z, y/z; missing coefficients are 0.
 
     `opencv`: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, τx, τy of OpenCV's pinhole model
     (docs.opencv.org, calib3d). `fisheye`: k1, k2, k3, k4 of its fisheye model, after Kannala and
@@ -42,14 +42,12 @@ class LensModel:
         object.__setattr__(self, "coefficients", np.append(given, np.zeros(count - len(given))))
 
     def bend(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Slopes `(...)` behind the lens from those before it."""
+        """Distorted coordinates `(...)` from undistorted ones."""
         return _MODELS[self.kind](self.coefficients, x, y)
 
     def straighten(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """Slopes `(...)` before the lens from those behind it, by Newton's method.
-
-        NaN where that does not converge: the lens folds over there, or it looks backwards.
-        """
+        """Undistorted coordinates `(...)` from distorted ones, by Newton's method; NaN where that
+        does not converge."""
         x, y, h = np.array(a, float), np.array(b, float), 1e-6
         for _ in range(_STEPS):
             u, v = self.bend(x, y)
@@ -113,10 +111,9 @@ _MODELS: dict[Kind, Callable[[Array, Array, Array], tuple[Array, Array]]] = {
 
 @dataclass(frozen=True, eq=False)
 class LensModelCamera(Camera):
-    """A camera whose pictures must be resampled to `Lens.of(camera).undistorted` to be used.
+    """A camera whose images must be resampled to `Lens.of(camera).undistorted`.
 
-    Raises `ValueError` where its lens cannot be inverted over the picture, or looks further to the
-    side than a pinhole can show.
+    Raises `ValueError` where its lens cannot be inverted over the image or is wider than a pinhole.
     """
 
     lens: LensModel = field(default_factory=lambda: LensModel("opencv", np.zeros(0)))
@@ -153,6 +150,6 @@ class LensModelCamera(Camera):
         if not reach < WIDEST:  # NaN too
             raise ValueError(
                 f"{self.name}: its {self.lens.kind} lens with {self.lens.coefficients.tolist()} "
-                "cannot be inverted over the picture, or looks over 79 degrees to the side: crop "
-                "and undistort its pictures before the import"
+                "cannot be inverted over the image, or covers more than 79 degrees off the axis: "
+                "crop and undistort its images before the import"
             )

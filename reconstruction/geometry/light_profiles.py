@@ -20,7 +20,7 @@ POLAR_FRAMES: dict[str, Array] = {
 }
 """Rows: where longitude is 0 and 90 degrees on the equator, and the pole where colatitude is 0.
 
-In the light's frame: x right, y down, z along its aim, as seen from behind it. C: the pole is
+In the light's frame: x right, y down, z along its aim, as viewed from behind it. C: the pole is
 the aim, longitudes run counter-clockwise from the right. A (headlamps): longitudes run about the
 vertical axis from the aim to the right, and colatitude - 90 degrees is the elevation. B
 (floodlights): longitudes run about the lateral axis from the aim upwards, and colatitude - 90
@@ -32,10 +32,10 @@ degrees is the angle to the right.
 class LightProfile:
     """Intensity over direction: `values (N, M)` at `longitude_deg (N,)` and `colatitude_deg (M,)`.
 
-    Both angles ascend, longitudes over at most one turn; what spans the whole turn is periodic.
-    Between nodes the values are bilinear in the angles, beyond the table 0. `photometry` places the
-    poles (`POLAR_FRAMES`). `unit` says what the values are: candela, W/sr, or a share of the peak
-    ("relative"). Raises `ValueError` naming the profile and the field.
+    Both angles ascend, longitudes over at most one turn; a full turn is periodic. Values are
+    bilinear in the angles, 0 beyond the table. `photometry` places the poles (`POLAR_FRAMES`).
+    `unit`: candela, W/sr, or a share of the peak ("relative"). Raises `ValueError` naming the
+    profile and the field.
     """
 
     name: str
@@ -92,7 +92,7 @@ class LightProfile:
         polar = np.asarray(directions, float) @ POLAR_FRAMES[self.photometry].T
         colatitude = np.degrees(np.arctan2(np.hypot(polar[..., 0], polar[..., 1]), polar[..., 2]))
         turn = np.degrees(np.arctan2(polar[..., 1], polar[..., 0])) - self.longitude_deg[0]
-        # A table centred on 0 degrees is not cut where it starts but a half turn from its middle.
+        # a table centred on 0 degrees wraps half a turn from its middle
         spare = 0.5 * (360.0 - (self.longitude_deg[-1] - self.longitude_deg[0]))
         return (turn + spare) % 360.0 - spare + self.longitude_deg[0], colatitude
 
@@ -102,8 +102,8 @@ class LightProfile:
         step = np.radians(np.diff(self.longitude_deg))
         across = 0.5 * (np.append(step, 0) + np.append(0, step))
         c = np.radians(self.colatitude_deg)
-        slope = np.diff(np.sin(c)) / np.diff(c)
-        along = np.append(np.cos(c[:-1]) - slope, 0) + np.append(0, slope - np.cos(c[1:]))
+        mean = np.diff(np.sin(c)) / np.diff(c)
+        along = np.append(np.cos(c[:-1]) - mean, 0) + np.append(0, mean - np.cos(c[1:]))
         return float(across @ self.values @ along)
 
     def to_dict(self) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class LightProfile:
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
 
 
-_SLACK_DEG = 1e-9  # a direction on a table's last node is in it, however it was rounded
+_SLACK_DEG = 1e-9  # keeps a direction on the last node inside despite rounding
 
 
 def _interval(nodes: Array, x: Array) -> tuple[Ints, Array, Bools]:

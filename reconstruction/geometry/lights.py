@@ -14,7 +14,7 @@ from reconstruction.geometry.light_profiles import LightProfile
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A light at `position (3,)` in metres; an isotropic point unless more is said.
+    """A light at `position (3,)` in metres, an isotropic point by default.
 
     `intensity (3,)` is the radiant intensity at full level, W/sr per linear RGB channel; with a
     `profile` it is multiplied by the profile's value: W/sr where that is relative to its peak, a
@@ -66,7 +66,7 @@ class Light:
             raise ValueError(f"{self.name}: a light with a profile or a size needs an aim")
 
     def intensity_towards(self, points: ArrayLike) -> Array:
-        """Radiant intensity `(..., 3)` towards world `points (..., 3)`, W/sr, from its centre."""
+        """Radiant intensity `(..., 3)`, W/sr, from the centre towards world `points (..., 3)`."""
         away = np.asarray(points, float) - self.position
         share: Any = 1.0
         if self.orientation is not None:
@@ -79,16 +79,13 @@ class Light:
         return self.intensity * np.broadcast_to(share, away.shape[:-1])[..., None]
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Light:
-        """The light that a moved subject sees: `x -> rotation (3, 3) @ x + translation (3,)`."""
+        """The light as a subject moved by `x -> rotation (3, 3) @ x + translation (3,)` has it."""
         Q, d = np.asarray(rotation, float), np.asarray(translation, float)
         turned = None if self.orientation is None else self.orientation @ Q
         return replace(self, position=Q.T @ (self.position - d), orientation=turned)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON-ready description that `Rig.from_dict` reads back exactly.
-
-        Names its profile, which the rig's description holds beside its lights.
-        """
+        """A JSON-ready description; the profile is only named, the rig's description holds it."""
         out: dict[str, Any] = {"name": self.name, "position": self.position.tolist()}
         out |= {"intensity": self.intensity.tolist(), "beside": self.beside}
         if self.orientation is not None:

@@ -22,7 +22,7 @@ LONGEST_LINE = 1 << 16
 class Mesh:
     """A triangle mesh: `vertices (V, 3) float64` in metres, `faces (F, 3) int64`.
 
-    `scalp (F,) bool` marks the faces that hair grows from, or is None where nobody said.
+    `scalp (F,) bool` marks the faces that hair grows from; None if unknown.
     """
 
     vertices: Array
@@ -69,8 +69,8 @@ def read_obj(path: str | Path, most: int | None = None) -> Mesh:
     """Read the triangles of a Wavefront OBJ; polygons are fanned.
 
     Faces in a group, object or material whose name contains "scalp" are marked as scalp; without
-    such a name `scalp` is None. Raises `OSError`, and `ValueError` naming the file where it holds
-    no triangles or more than `most`, is no text, no regular file or has more than 256 MiB.
+    such a name `scalp` is None. Raises `OSError`, and `ValueError` naming the file if it has no
+    triangles or more than `most`, is no text, no regular file or larger than 256 MiB.
     """
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
@@ -142,5 +142,5 @@ def write_obj(path: str | Path, mesh: Mesh) -> None:
 
 
 def _blocks(rows: NDArray[Any]) -> Iterator[list[Any]]:
-    """Rows as Python numbers, some at a time: all at once would take many times their memory."""
+    """Rows as Python numbers, 65,536 at a time to bound memory."""
     return (rows[i : i + 65536].tolist() for i in range(0, len(rows), 65536))

@@ -1,4 +1,4 @@
-"""What a mesh or points are to voxels and cameras: samples, inside, depth and silhouette."""
+"""Samples, inside test, depth and silhouette of meshes and points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from reconstruction.geometry.voxels import VoxelGrid
 
 
 def surface_samples(mesh: Mesh, spacing: float) -> tuple[Array, Array, Ints]:
-    """Points `(M, 3)` on the mesh no more than about `spacing` metres apart, evenly laid out.
+    """Points `(M, 3)` on the mesh, evenly spaced at most about `spacing` metres apart.
 
     Also their smooth unit normals `(M, 3)` (the vertices', interpolated) and faces `(M,)`.
     """
@@ -43,12 +43,11 @@ def surface_samples(mesh: Mesh, spacing: float) -> tuple[Array, Array, Ints]:
 def inside_mesh(grid: VoxelGrid, mesh: Mesh) -> Bools:
     """Voxels `grid.inside.shape` with their centre in the mesh: most of six ray parities agree.
 
-    Scanned and modelled heads are open at the neck and often at the eyes; a vote over both
-    directions of three axes keeps such a hole from turning whole columns inside out.
+    The vote tolerates holes: scanned heads are open at the neck and often at the eyes.
     """
     votes = np.zeros(grid.inside.shape, np.int8)
     corners = (mesh.vertices[mesh.faces] - grid.origin) / grid.spacing  # (F, 3, 3), voxels
-    # Off the lattice by a hair's breadth: no column may run along an edge shared by two faces.
+    # off the lattice, so that no column runs along an edge shared by two faces
     corners = corners + np.array([1.3e-6, 2.1e-6, 1.7e-6])
     for axis in range(3):
         before, total = _crossings(corners, grid.inside.shape, axis)
@@ -89,13 +88,12 @@ def _crossings(
 
 
 def depth_map(camera: Camera, points: AnyFloats) -> Array:
-    """Depth `(H, W)` along z, metres: the median of the points on a pixel, 0 where there are none.
+    """Depth `(H, W)` along z, metres: the lower median of a pixel's points, 0 without any.
 
-    A pixel has a point for each projector that reaches it; the lower median of those outvotes a
-    single wrong one, and of two takes the nearer, which carves less.
+    A pixel has a point per projector that reaches it.
     """
-    seen, x, y, depth = camera.pixels_of(points)
-    flat, depth = (y * camera.width + x)[seen], depth[seen]
+    visible, x, y, depth = camera.pixels_of(points)
+    flat, depth = (y * camera.width + x)[visible], depth[visible]
     order = np.lexsort((depth, flat))
     pixel, start, count = np.unique(flat[order], return_index=True, return_counts=True)
     out = np.zeros(camera.height * camera.width)
@@ -104,11 +102,10 @@ def depth_map(camera: Camera, points: AnyFloats) -> Array:
 
 
 def mesh_depth(camera: Camera, mesh: Mesh) -> Array:
-    """Depth `(H, W)` along z of the mesh's nearest surface, infinite where it is not seen.
+    """Depth `(H, W)` along z of the mesh's nearest surface, infinite off the mesh.
 
-    Faces are painted from far to near, each pixel takes its face's plane: right where faces are
-    small against the distances between surfaces that hide each other. Faces that reach behind the
-    camera are left out.
+    Painter's algorithm, then the plane of each pixel's face. Faces that reach behind the camera
+    are skipped.
     """
     pixels, depth = camera.project(mesh.vertices)
     corners = depth[mesh.faces]
@@ -116,26 +113,26 @@ def mesh_depth(camera: Camera, mesh: Mesh) -> Array:
     usable = (corners > 1e-3).all(axis=1) & (np.abs(pixels[mesh.faces]) < limit).all(axis=(1, 2))
     order = np.flatnonzero(usable)
     order = order[np.argsort(-corners[order].mean(axis=1), kind="stable")]
-    painted = np.full((camera.height, camera.width), -1, np.int32)
+    nearest = np.full((camera.height, camera.width), -1, np.int32)
     shift = 4  # OpenCV's fixed-point bits below the pixel
     triangles = np.rint(pixels[mesh.faces[order]] * (1 << shift)).astype(np.int32)
     for number, triangle in zip(order.tolist(), triangles, strict=True):
-        cv2.fillConvexPoly(painted, triangle, number, lineType=cv2.LINE_8, shift=shift)
-    out = np.full(painted.shape, np.inf)
-    y, x = np.nonzero(painted >= 0)
-    face = painted[y, x]
+        cv2.fillConvexPoly(nearest, triangle, number, lineType=cv2.LINE_8, shift=shift)
+    out = np.full(nearest.shape, np.inf)
+    y, x = np.nonzero(nearest >= 0)
+    face = nearest[y, x]
     rays = camera.rays(np.stack([x, y], axis=1))
     normals, base = mesh.face_normals()[face], mesh.vertices[mesh.faces[face, 0]]
-    slope = np.einsum("nk,nk->n", normals, rays)
+    cosine = np.einsum("nk,nk->n", normals, rays)
     reach = np.einsum("nk,nk->n", normals, base - camera.center)
-    along = reach / np.where(np.abs(slope) > 1e-9, slope, np.inf) * (rays @ camera.R[2])
+    along = reach / np.where(np.abs(cosine) > 1e-9, cosine, np.inf) * (rays @ camera.R[2])
     low, high = corners[face].min(axis=1), corners[face].max(axis=1)
     out[y, x] = np.clip(along, low, high)  # an edge's pixel may lie just beside its face
     return out
 
 
 def mesh_silhouette(camera: Camera, mesh: Mesh) -> Bools:
-    """The pixels `(H, W)` that a mesh covers or its outline touches, as far as it is in front."""
+    """The pixels `(H, W)` that the part of a mesh in front of the camera covers or touches."""
     pixels, depth = camera.project(mesh.vertices)
     faces = mesh.faces[(depth[mesh.faces] > 1e-6).all(axis=1)]
     image = np.zeros((camera.height, camera.width), np.uint8)

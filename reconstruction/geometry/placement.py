@@ -1,7 +1,6 @@
-"""Cameras and lights that others calibrated, brought into our world; is it plausible there?
+"""Imported cameras and lights in our world (metres, z up, OpenCV axes), and plausibility checks.
 
-Our world is in metres with z up, its cameras look along z with y down. Files of cameras say neither
-their unit nor which way is up, and some take the camera's axes for OpenGL's.
+Camera files give neither unit nor up axis, and some use OpenGL's camera axes.
 """
 
 from __future__ import annotations
@@ -27,16 +26,15 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 class PlacementError(ValueError):
-    """Cameras or lights that cannot stand like this; the message says what to do."""
+    """Implausible placement of cameras or lights; the message names the option to give."""
 
 
 @options
 class PlacementOptions:
-    """What a user says of files of cameras and lights.
+    """Unit and axes of imported cameras and lights.
 
-    `unit` is the length of the cameras' unit, by name or in metres, `light_unit` the lights' where
-    it differs; `up` the axis of the world that points up; `camera_axes` those of the cameras, where
-    they are not what the format says.
+    `unit` is the length of the cameras' unit, by name or in metres, `light_unit` the lights' if it
+    differs; `up` the axis of the world that points up; `camera_axes` overrides the format's.
     """
 
     unit: Unit = "m"
@@ -51,10 +49,7 @@ def metres(unit: Unit) -> float:
 
 
 def to_z_up(up: Up) -> Array:
-    """The rotation `(3, 3)` that takes the axis `up` to z.
-
-    y goes to z by a quarter turn about x, as from Blender's exporters and back.
-    """
+    """The rotation `(3, 3)` that takes the axis `up` to z; y by a quarter turn about x."""
     axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
     if axis == 2:
         return np.eye(3) if sign > 0 else np.diag([1.0, -1.0, -1.0])
@@ -66,7 +61,7 @@ def to_z_up(up: Up) -> Array:
 def placed(
     cameras: Sequence[Camera], options: PlacementOptions, axes: Literal["opencv", "opengl"]
 ) -> list[Camera]:
-    """The cameras in metres, z up, with our axes; their file was read as if it had `axes`."""
+    """The cameras in metres, z up, with OpenCV axes; their file was read with `axes`."""
     turn = to_z_up(options.up or "z")
     flip = _FLIP if options.camera_axes not in (None, axes) else np.eye(3)
     out = []
@@ -91,9 +86,9 @@ def placed_lights(lights: Sequence[Light], options: PlacementOptions) -> list[Li
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """`camera` with the intrinsics of its picture scaled to `width` x `height`.
+    """`camera` with intrinsics scaled to `width` x `height`.
 
-    Raises `PlacementError` where that picture has another shape: it was cropped or turned.
+    Raises `PlacementError` for another aspect ratio: the image was cropped or rotated.
     """
     if (width, height) == (camera.width, camera.height):
         return camera
@@ -102,11 +97,11 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
         turned = abs(camera.height * height - camera.width * width) <= max(width, height)
         raise PlacementError(
             f"{camera.name}: its calibration is for {camera.width}x{camera.height} pixels, the "
-            f"picture has {width}x{height}: "
+            f"image has {width}x{height}: "
             + (
-                "turn the pictures by 90° (and beware of EXIF's orientation)"
+                "rotate the images by 90° (check the EXIF orientation)"
                 if turned and width != height
-                else "no scaled copy; calibrate for the cropped pictures, or give whole ones"
+                else "it was cropped; calibrate for the cropped images, or give uncropped ones"
             )
         )
     K = camera.K.copy()
@@ -118,79 +113,78 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 @dataclass(frozen=True)
 class Sight:
-    """What cameras look at together.
+    """The common target of cameras.
 
-    `point (3,)` is nearest to all lines through the pictures' centres, `distance (N,)` how far it
-    is from each camera, `seen (N,)` whether it is in front of that and on its picture, or at most
-    half a picture beside it. `diversity` is 0 where all look the same way, 1 from all around.
-    `astray` is the median angle by which cameras look past the point, over that between a camera's
-    way to look and their mean: small where they turn to one point, about 1 where by chance.
+    `point (3,)` is nearest to all optical axes, `distance (N,)` how far it is from each camera,
+    `visible (N,)` whether it is in front of a camera and at most half an image outside of it.
+    `diversity` is 0 for parallel axes, 1 for cameras all around. `astray` is the median angle
+    between axis and point over that between axis and mean axis: about 1 for random directions.
     """
 
     point: Array
     distance: Array
-    seen: Bools
+    visible: Bools
     diversity: float
     astray: float
 
     @property
     def whole(self) -> bool:
         """Whether nine in ten cameras see it."""
-        return bool(self.seen.mean() >= 0.9)
+        return bool(self.visible.mean() >= 0.9)
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Sight:
-        """Raises `PlacementError` where all cameras look the same way, or there is but one."""
+        """Raises `PlacementError` for parallel axes or a single camera."""
         centers = np.array([c.center for c in cameras])
         axes = np.array([c.rays([(c.width - 1) / 2, (c.height - 1) / 2]) for c in cameras])
         weight, point = np.ones(len(cameras)), np.zeros(3)
-        for _ in range(20):  # few cameras that look elsewhere shall not draw the point to them
+        for _ in range(20):  # reweighted: robust to single cameras that look elsewhere
             across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
             A = (weight[:, None, None] * across).sum(axis=0)
             if np.linalg.cond(A) > 1e8:
-                raise PlacementError("the cameras all look the same way: nothing is in their midst")
+                raise PlacementError("the cameras' optical axes are parallel: no common target")
             point = np.linalg.solve(A, np.einsum("n,nij,nj->i", weight, across, centers))
             miss = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centers), axis=1)
             weight = 1 / np.maximum(miss, 1e-3 * np.median(miss) + 1e-12)
-        seen = []
+        visible = []
         for camera in cameras:
             pixel, depth = camera.pinhole().project(point)
             beside = np.abs(pixel / (camera.width, camera.height) - 0.5)
-            seen.append(bool(depth > 0 and (beside < 1).all()))
+            visible.append(bool(depth > 0 and (beside < 1).all()))
         distance = np.linalg.norm(centers - point, axis=1)
         along = np.einsum("ni,ni->n", axes, point - centers)
         past = np.median(np.abs(np.arctan2(np.sqrt(np.maximum(distance**2 - along**2, 0)), along)))
         diversity = 1 - float(np.linalg.norm(axes.mean(axis=0)))
         astray = float(past) / max(float(np.arccos(1 - diversity)), 1e-12)
-        return cls(point, distance, np.array(seen), diversity, astray)
+        return cls(point, distance, np.array(visible), diversity, astray)
 
 
 def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: str) -> list[str]:
-    """Whether cameras that were `placed` can be a stage's; what there is to be said of them.
+    """Check that `placed` cameras can be a stage's; returns notes for the user.
 
-    Raises `PlacementError` that names the option to give where axes, unit or the world's up are
-    not what they were taken for, and the cameras where single ones look elsewhere.
+    Raises `PlacementError` naming the option to give if axes, unit or up axis are implausible, or
+    the cameras that do not look at the common target.
     """
     if len(cameras) < 2:
-        return ["one camera alone: nothing says whether unit and axes are right"]
+        return ["one camera: unit and axes cannot be checked"]
     sight = Sight.of(cameras)
-    for told, reading in _misreadings(cameras, options.camera_axes or axes).items():
+    for hint, reading in _misreadings(cameras, options.camera_axes or axes).items():
         other = _sight(reading)
         if other is None or not other.whole:
             continue
         closer = sight.diversity < 0.5 * other.diversity and other.astray < sight.astray
         if closer or not sight.whole:
-            raise PlacementError(f"the cameras do not look at anything together, but do {told}")
+            raise PlacementError(f"the cameras have no common target, but would have one {hint}")
     if not sight.whole:
         raise PlacementError(_elsewhere(cameras, sight))
     notes = []
-    if not sight.seen.all():
-        names = [c.name for c, seen in zip(cameras, sight.seen, strict=True) if not seen]
-        notes.append(f"{', '.join(names)}: do not look at what the other cameras look at")
+    if not sight.visible.all():
+        names = [c.name for c, here in zip(cameras, sight.visible, strict=True) if not here]
+        notes.append(f"{', '.join(names)}: the common target of the cameras is out of view")
     distance = float(np.median(sight.distance))
     if not NEAREST <= distance <= FURTHEST:
         scaled = {n: distance * m / metres(options.unit) for n, m in METRES.items()}
-        text = f"the cameras stand {length(distance)} from what they look at"
+        text = f"the cameras stand {length(distance)} from their common target"
         raise PlacementError(text + _right_unit(scaled, "--unit"))
     try:
         unsure = _check_up(cameras)
@@ -199,21 +193,20 @@ def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: st
         if options.up is None:
             raise
         notes.append(
-            f"--up {options.up} is believed, though the cameras then lie on their side or stand on "
-            "their heads"
+            f"--up {options.up} was applied, but the cameras are then on their side or upside down"
         )
     width = float(
         np.median([d * c.width / c.K[0, 0] for c, d in zip(cameras, sight.distance, strict=True)])
     )
     notes.append(
-        f"cameras stand {distance:.2f} m from what they look at, where their pictures are "
+        f"cameras stand {distance:.2f} m from their common target, where their images are "
         f"{width:.2f} m wide"
     )
     return notes
 
 
 def check_lights(cameras: Sequence[Camera], lights: Sequence[Light], unit: Unit) -> None:
-    """Raises `PlacementError` where lights stand too far from what the cameras look at."""
+    """Raises `PlacementError` for lights too near to or far from the cameras' common target."""
     if len(cameras) < 2 or not lights:
         return
     point = Sight.of(cameras).point
@@ -224,54 +217,53 @@ def check_lights(cameras: Sequence[Camera], lights: Sequence[Light], unit: Unit)
 
     if not NEAREST <= distance(1.0) <= FURTHEST:
         scaled = {n: distance(m / metres(unit)) for n, m in METRES.items()}
-        text = f"the lights stand {length(distance(1.0))} from what the cameras look at"
+        text = f"the lights stand {length(distance(1.0))} from the cameras' common target"
         raise PlacementError(text + _right_unit(scaled, "--light-unit"))
 
 
 def _right_unit(distances: dict[str, float], option: str) -> str:
-    """What to give where the distances in metres are those if the file counts in each unit."""
+    """The option to give, from the distances in metres that each unit would result in."""
     fits = [n for n, d in distances.items() if 2 * NEAREST <= d <= FURTHEST / 2]
     fits = [n for n in fits if n != "inch"] or fits
     if not fits:
         return f": give the length of their unit in metres, as {option} 0.37"
     names = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "inch": "inches"}
-    return "; their file counts in " + " or ".join(f"{names[n]}: give {option} {n}" for n in fits)
+    return "; their file is in " + " or ".join(f"{names[n]}: give {option} {n}" for n in fits)
 
 
 def length(value: float) -> str:
-    """`value` metres, for people."""
+    """`value` metres as text with a unit."""
     if value >= 1000:
         return f"{value / 1000:.3g} km"
     return f"{value:.3g} m" if value >= 0.1 else f"{1000 * value:.3g} mm"
 
 
 def _elsewhere(cameras: Sequence[Camera], sight: Sight) -> str:
-    names = [c.name for c, seen in zip(cameras, sight.seen, strict=True) if not seen]
+    names = [c.name for c, here in zip(cameras, sight.visible, strict=True) if not here]
     return (
-        f"{len(names)} of {len(cameras)} cameras do not look at what the others look at: "
-        f"{', '.join(names[:8])}{', …' if len(names) > 8 else ''}; are the poses of one solution, "
-        "and do they take the world to the camera?"
+        f"{len(names)} of {len(cameras)} cameras do not look at the common target: "
+        f"{', '.join(names[:8])}{', …' if len(names) > 8 else ''}; check that all poses are of one "
+        "solution and are world-to-camera"
     )
 
 
 def _misreadings(cameras: Sequence[Camera], read: str) -> dict[str, list[Camera]]:
-    """How the cameras would stand had their file been read in another way, by what to do then.
+    """The cameras under other interpretations of their file, by the hint for the user.
 
-    Read the other way round, cameras that look at one point end up in one place and look the same
-    way: the reading in which they look from the most sides is the right one, if they look at one
-    point there at all. Where the origin is elsewhere, a wrong reading may show all kinds of ways.
+    Under inverted poses, cameras around a subject end up in one place with parallel axes: the
+    interpretation of the greatest diversity that has a common target is right.
     """
     other = "opencv" if read == "opengl" else "opengl"
-    inverse = "the file gives camera-to-world where world-to-camera is asked for (or the reverse)"
+    inverse = "the file has camera-to-world where world-to-camera is expected (or the reverse)"
     return {
-        f"with {_AXES[other]}, where {_AXES[read]} were read: give --camera-axes {other}": [
+        f"with {_AXES[other]} instead of {_AXES[read]}: give --camera-axes {other}": [
             replace(c, R=_FLIP @ c.R, t=_FLIP @ c.t) for c in cameras
         ],
-        f"with their poses the other way round: {inverse}; invert them": [
+        f"with inverted poses: {inverse}; invert them": [
             replace(c, R=c.R.T, t=c.center) for c in cameras
         ],
-        f"with their poses the other way round and {_AXES[other]}: {inverse}; invert them, and "
-        f"give --camera-axes {other}": [
+        f"with inverted poses and {_AXES[other]}: {inverse}; invert them, and give "
+        f"--camera-axes {other}": [
             replace(c, R=_FLIP @ c.R.T, t=_FLIP @ c.center) for c in cameras
         ],
     }
@@ -291,11 +283,7 @@ def _sight(cameras: Sequence[Camera]) -> Sight | None:
 
 
 def _check_up(cameras: Sequence[Camera]) -> list[str]:
-    """Raises where pictures stand upright, or on their side, to another axis than z.
-
-    One axis of a picture that is upright or turned by 90° runs along up, unless the camera looks
-    up or down steeply.
-    """
+    """Raises where the images are upright, or rotated by 90°, about another axis than z."""
     right, down = (np.array([c.R[i] for c in cameras]) for i in (0, 1))
     upright = np.quantile(np.abs(down), 0.1, axis=0)  # along x, y, z; one in ten may be steep
     along = np.quantile(np.maximum(np.abs(right), np.abs(down)), 0.1, axis=0)
@@ -308,7 +296,7 @@ def _check_up(cameras: Sequence[Camera]) -> list[str]:
         if up == "z" or (measure[2] >= 0.6 and axis != 2):
             return []
         raise PlacementError(
-            f"the cameras stand upright to the axis {up} of their world, not to z, which is up "
-            f"here: give --up {up} (or --up z where it is up indeed)"
+            f"the cameras are upright along the axis {up} of their world, not along z: give "
+            f"--up {up} (or --up z if z is up)"
         )
-    return ["the cameras' tilts do not say which way is up: z was taken (else give --up)"]
+    return ["the up axis is undetermined by the cameras' tilts: z was assumed (else give --up)"]

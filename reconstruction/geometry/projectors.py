@@ -19,7 +19,7 @@ class Projector(Pinhole):
 
     `intensity (3,)` is the radiant intensity, W/sr per channel, towards any direction inside the
     frustum when every row is on. A single row is blurred across rows by a Gaussian of `line_sigma`
-    rows (defocus and finite pixels); the rows of a sweep sum to the all-on picture.
+    rows; the rows of a sweep sum to the all-on image.
     """
 
     intensity: Array = field(default_factory=lambda: np.ones(3))

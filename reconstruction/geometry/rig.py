@@ -43,11 +43,11 @@ class Rig:
             for name in names:
                 if not is_file_name(name):
                     shown = repr(name)[:60]
-                    raise RigError(f"{kind}: {shown} is no name: files are called by it")
+                    raise RigError(f"{kind}: {shown} cannot be a name: files are named by it")
         kept = self.profiles
         for profile in (x.profile for x in self.lights if x.profile is not None):
             if kept[profile.name] is not profile:
-                raise RigError(f"rig {self.name}: two profiles are called {profile.name!r}")
+                raise RigError(f"rig {self.name}: two profiles are named {profile.name!r}")
 
     @property
     def profiles(self) -> dict[str, LightProfile]:
@@ -55,15 +55,15 @@ class Rig:
         return {x.profile.name: x.profile for x in self.lights if x.profile is not None}
 
     def camera(self, name: str) -> Camera:
-        """The camera called `name`; KeyError names the ones there are."""
+        """The camera called `name`; KeyError lists the names."""
         return _named(self.cameras, name, "camera")
 
     def light(self, name: str) -> Light:
-        """The light called `name`; KeyError names the ones there are."""
+        """The light called `name`; KeyError lists the names."""
         return _named(self.lights, name, "light")
 
     def projector(self, name: str) -> Projector:
-        """The projector called `name`; KeyError names the ones there are."""
+        """The projector called `name`; KeyError lists the names."""
         return _named(self.projectors, name, "projector")
 
     @classmethod
@@ -89,9 +89,9 @@ class Rig:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], folder: Path = Path()) -> Rig:
-        """Build a rig from the tables of a rig file; the device tables are not looked at.
+        """Build a rig from the tables of a rig file; device tables are ignored.
 
-        Files that it names, such as IES profiles, are looked for in `folder`.
+        Files that it names, such as IES profiles, are relative to `folder`.
         """
         cameras = tuple(_pinholes(Camera, data, "cameras"))
         if not cameras:
@@ -123,7 +123,7 @@ def _named(items: tuple[T, ...], name: str, kind: str) -> T:
 
 
 def counted(names: Sequence[str]) -> str:
-    """How many `names` there are and which, of many the first and the last."""
+    """The number of `names` and a list, of many the first and the last three."""
     some = names if len(names) <= 12 else [*names[:3], "…", *names[-3:]]
     return f"its {len(names)} are {', '.join(some)}" if names else "it has none"
 

@@ -1,4 +1,4 @@
-"""Rigid motions, and the one that brings calibrated devices into another's frame."""
+"""Rigid motions, and the one that aligns two sets of calibrated devices."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Rigid:
 
     @classmethod
     def identity(cls) -> Self:
-        """The motion that leaves everything where it is."""
+        """The identity."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
@@ -40,7 +40,7 @@ class Rigid:
         return np.concatenate([turn, self.translation])
 
     def inverse(self) -> Rigid:
-        """The motion back."""
+        """The inverse motion."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
 
     def __matmul__(self, first: Rigid) -> Rigid:
@@ -50,16 +50,15 @@ class Rigid:
         """Points `(..., 3)` moved."""
         return np.asarray(points, float) @ self.rotation.T + self.translation
 
-    def seen_by(self, device: P) -> P:
-        """`device` in the frame that this motion leads from: it sees x as it saw the moved x."""
+    def in_frame(self, device: P) -> P:
+        """`device` in the frame that this motion maps from."""
         return device.moved(self.rotation, self.translation)
 
 
 def align_devices(found: Sequence[Pinhole], wanted: Sequence[Pinhole]) -> Rigid:
     """The rigid motion from the world of `found` to that of `wanted`, device for device.
 
-    By their centres and by points half a metre along their axes, so that one device suffices
-    (Kabsch 1976).
+    Kabsch 1976, on centres and points half a metre along the axes: one device suffices.
     """
 
     def points(devices: Sequence[Pinhole]) -> Array:

@@ -1,7 +1,4 @@
-"""Signed distances to simple bodies, and their rounded unions: what procedural shapes are made of.
-
-Distances are in metres, negative inside; points are `(..., 3)`, results `(...)`.
-"""
+"""Signed distances to simple bodies and their rounded unions, metres, negative inside."""
 
 from __future__ import annotations
 

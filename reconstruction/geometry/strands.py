@@ -16,8 +16,8 @@ class Strands:
     """Strands as polylines, root first.
 
     `points (N, 3) float32` in metres; strand `i` is `points[offsets[i]:offsets[i + 1]]` with
-    `offsets (S + 1,) int64`; `radius` in metres, a scalar or `(N,)`. `confidence (N,)`, where it is
-    known, says how well measurements agree with each point: 0 where it is guessed, at most 1.
+    `offsets (S + 1,) int64`; `radius` in metres, a scalar or `(N,)`. `confidence (N,)` in [0, 1],
+    if known, is the agreement of measurements with each point: 0 where it is guessed.
 
     Raises `ValueError` where offsets do not partition the points, a strand has under two points,
     a coordinate is not finite or a confidence not in [0, 1].
@@ -160,10 +160,7 @@ class Strands:
 
 
 class Resampling:
-    """The points of `strands.resampled(step)`, any of them, without making the others.
-
-    `offsets (S + 1,)` are those of the resampled strands.
-    """
+    """Points of `strands.resampled(step)` on demand; `offsets (S + 1,)` are those of the result."""
 
     def __init__(self, strands: Strands, step: float) -> None:
         if not step > 0:
@@ -210,20 +207,18 @@ class Resampling:
 
 
 def unit_or_zero(vectors: Array) -> Array:
-    """`vectors (N, 3)` of length 1; 0 where they are."""
+    """Unit vectors along `vectors (N, 3)`; 0 stays 0."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
-_AT_A_TIME = 400  # lines: what the processor keeps near
+_AT_A_TIME = 400  # lines that fit the processor's cache
 
 
 def smoothed(lines: Sequence[Array], sigma: float) -> list[Array]:
-    """Polylines `(N, 3)` under a Gaussian of `sigma` metres along them, ends where they were.
+    """Polylines `(N, 3)` smoothed by a Gaussian of `sigma` metres along them, ends fixed.
 
-    Points a third of a millimetre apart and a tenth aside turn by more than ten degrees from one
-    to the next: where they lie is well known, where they lead to is not, before this. The Gaussian
-    is cut at four deviations; beyond its ends a line goes on as its own point reflection.
+    The Gaussian is cut at four deviations; beyond its ends a line is extended by point reflection.
     """
     out: list[Array] = []
     for first in range(0, len(lines), _AT_A_TIME):

@@ -12,10 +12,9 @@ from reconstruction.arrays import Array, Bools, Ints
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """A boolean volume.
+    """A boolean volume `inside (nx, ny, nz)`.
 
-    `origin (3,)` is the centre of voxel (0, 0, 0) in metres, `spacing` the edge of the cubic voxels
-    in metres, `inside (nx, ny, nz) bool` marks the voxels that belong to the volume.
+    `origin (3,)` is the centre of voxel (0, 0, 0), `spacing` the voxels' edge, both in metres.
     """
 
     origin: Array

@@ -34,9 +34,9 @@ def to_tensors(directions: AnyFloats) -> Array:
 
 
 def principal(tensors: Array) -> tuple[Array, Array]:
-    """Unit eigenvectors `(N, 3)` of the largest eigenvalue, and eigenvalues `(N, 3)`.
+    """Unit eigenvectors `(N, 3)` of the largest eigenvalue, and eigenvalues `(N, 3)`, descending.
 
-    `tensors (N, 6)` as `to_tensors` makes them; eigenvalues have the largest first.
+    `tensors (N, 6)` as of `to_tensors`.
     """
     full = np.empty((len(tensors), 3, 3))
     full[:, _ROWS, _COLUMNS] = tensors
@@ -64,8 +64,7 @@ class OrientationField:
     empty: Bools
     degenerate: Bools
 
-    # Two voxels of nothing on each side, so that eight corners are looked up at once without
-    # asking whether they are on the grid; nothing is the row of zeros after the last voxel.
+    # padded by two voxels that map to the row of zeros after the last voxel: no bounds checks
     @cached_property
     def _padded(self) -> NDArray[np.int32]:
         count = len(self.directions)
@@ -102,11 +101,10 @@ class OrientationField:
         return np.where(number == len(self.directions), -1, number).astype(np.int64)
 
     def sample(self, points: AnyFloats, along: Array) -> tuple[Array, Bools]:
-        """Directions `(N, 3)` at `points (N, 3)`, each signed to turn least from `along (N, 3)`.
+        """Directions `(N, 3)` at `points (N, 3)`, signed to agree with `along (N, 3)`.
 
-        The eight voxels around a point are interpolated trilinearly after their signs are made to
-        agree with `along`; those outside the envelope or without orientation take no part. Also
-        says where there was anything to interpolate `(N,)`.
+        Trilinear over the voxels that have an orientation, signs aligned first. Also where there
+        is any such voxel `(N,)`.
         """
         q = (points - self.grid.origin) / self.grid.spacing
         base = np.floor(q)
@@ -125,7 +123,7 @@ class OrientationField:
         return np.where(good[:, None], total / np.where(good, norm, 1.0)[:, None], 0.0), good
 
     def _flat(self, index: Ints) -> Ints:
-        """Places `(N,)` in the padded volume; voxels far off the grid fall on its rim."""
+        """Flat indices `(N,)` into the padded volume; voxels off the grid fall on its rim."""
         inside = np.clip(index + _PAD, 0, np.array(self._padded.shape) - 2)
         return np.asarray(inside @ self._strides)
 
@@ -140,8 +138,8 @@ DOWN = np.array([0.0, 0.0, -1.0])
 def descent(grid: VoxelGrid, head: Bools | None = None) -> tuple[Array, Array]:
     """Centres `(N, 3)` of the outer surface's voxels and unit directions `(N, 3)` of descent.
 
-    The steepest way down within the surface is where hair lies of which nothing else is known.
-    Where the envelope touches the `head`'s inside `(X, Y, Z)` is no outer surface.
+    The steepest descent within the surface is the prior for unmeasured hair. Voxels that touch the
+    `head`'s inside `(X, Y, Z)` are no outer surface.
     """
     solid = np.pad(grid.inside if head is None else grid.inside | head, 4)
     surface = solid & ~ndimage.binary_erosion(solid)
@@ -150,20 +148,17 @@ def descent(grid: VoxelGrid, head: Bools | None = None) -> tuple[Array, Array]:
     normal = -np.stack([g[tuple(index.T + 4)] for g in np.gradient(smooth)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     tangent = DOWN - (normal @ DOWN)[:, None] * normal
-    slope = np.linalg.norm(tangent, axis=1)
-    keep = slope > 0.1  # flatter than 6 degrees, the way down is the voxels' noise
-    return grid.centers(index[keep]), tangent[keep] / slope[keep, None]
+    steepness = np.linalg.norm(tangent, axis=1)
+    keep = steepness > 0.1  # below 6 degrees the descent is voxel noise
+    return grid.centers(index[keep]), tangent[keep] / steepness[keep, None]
 
 
 DESCENT_WEIGHT = 0.3
-"""Of the way down, beside the confidences (0 to 1) of measured lines in the same voxel."""
+"""Confidence of the descent prior, beside that of measured lines in the same voxel (0 to 1)."""
 
 
 def with_descent(grid: VoxelGrid, measured: Measured, head: Bools) -> Measured:
-    """The measured lines and, all over the outer surface, the way down (`descent`).
-
-    Where nothing was measured that is all there is; elsewhere the lines pull the surface's field.
-    """
+    """The measured lines and, all over the outer surface, the `descent` prior."""
     points, directions = descent(grid, head)
     return Measured(
         np.concatenate([measured.points, points]),
@@ -177,8 +172,7 @@ def gather(
 ) -> tuple[Ints, Array, Array]:
     """Data per voxel: numbers `(D,)` of the voxels hit, mean tensors `(D, 6)`, weights `(D,)`.
 
-    Points outside the envelope are given to the nearest of the 26 neighbours that is inside, or
-    are dropped: a measured surface point may lie a fraction of a voxel in front of the envelope.
+    Points outside the envelope go to the nearest of the 26 neighbours inside, or are dropped.
     """
     number = np.full(grid.inside.shape, -1, np.int64)
     number[grid.inside] = np.arange(int(grid.inside.sum()))
@@ -215,13 +209,12 @@ def solve_field(
 ) -> tuple[OrientationField, Series | None]:
     """Spread measured lines through the envelope: Laplace's equation for each tensor entry.
 
-    `points (N, 3)` with `directions (N, 3)` and `weights (N,)` are the measured lines: Dirichlet
-    data; the envelope's surface passes no flux. That is the state of rest of Photobooth Eq. 3,
-    solved to a relative residual of `tolerance`. The paper holds the field to the scalp's normals
-    as well; hair that lies flat on the head is turned wrongly by that. Also returns error against
-    run time, None where nothing is unknown.
+    The steady state of Photobooth Eq. 3: Dirichlet data at `points (N, 3)` with `directions (N, 3)`
+    and `weights (N,)`, no flux through the envelope's surface, solved to a relative residual of
+    `tolerance`. Unlike the paper, the scalp's normals are no boundary condition: hair that lies
+    flat on the head would turn. Also returns error against run time, None without unknowns.
 
-    Raises `ValueError` for an empty envelope or when no datum falls into it.
+    Raises `ValueError` for an empty envelope or without data inside.
     """
     system = field_system(grid, points, directions, weights)
     values, free = system.values.copy(), system.free
@@ -267,7 +260,7 @@ class FieldSystem:
 def field_system(
     grid: VoxelGrid, points: AnyFloats, directions: AnyFloats, weights: AnyFloats | None = None
 ) -> FieldSystem:
-    """The linear system of `solve_field`, which says what the arguments are and what it raises."""
+    """The linear system of `solve_field`, with the same arguments and errors."""
     count = int(grid.inside.sum())
     if count == 0:
         raise ValueError("the hair's envelope is empty: check masks and poses")

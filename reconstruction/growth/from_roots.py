@@ -5,37 +5,28 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.growth.field import OrientationField
 
-Method = Literal["euler", "midpoint", "rk4"]
-
-_LIFT = 12e-3  # metres that a root is lifted by, at most, to where there is hair
+_LIFT = 12e-3  # metres along the normal within which a root's envelope may begin
 _SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3
-"""Metres under which strands are not kept; half of `Tracing.max_length` where that is less."""
+"""Metres below which strands are dropped; half of `Tracing.max_length` if that is less."""
 
 _ROUNDS = 120
 
 _TOGETHER = 2000
-"""Strands that are traced at once: enough to keep numpy busy, few enough for the caches."""
+"""Strands traced at once."""
 
 
 @dataclass(frozen=True)
 class Tracing:
-    """How a field is followed: `step` metres at a time, at most `max_length` metres far.
-
-    `euler` samples the field once a step, `midpoint` twice, `rk4` four times. At half a millimetre
-    `midpoint` is a micrometre or two from the field's own line at half of `rk4`'s time, `euler` a
-    tenth of a millimetre, in tight curls several (the benchmarks' `compare_growth`).
-    """
+    """How a field is followed: midpoint steps of `step` metres, at most `max_length` metres."""
 
     step: float = 5e-4
     max_length: float = 0.3
-    method: Method = "midpoint"
 
     def __post_init__(self) -> None:
         if not self.step > 0 or not self.max_length >= self.step:
@@ -45,10 +36,9 @@ class Tracing:
 def trace(
     field: OrientationField, starts: AnyFloats, along: AnyFloats, tracing: Tracing = Tracing()
 ) -> list[Floats]:
-    """Paths `(T, 3)` along the field from `starts (N, 3)`, setting out along `along (N, 3)`.
+    """Paths `(T, 3)` along the field from `starts (N, 3)`, initially along `along (N, 3)`.
 
-    At every step the line's sign is the one that turns least. A path ends where it leaves the
-    envelope or the field has no orientation.
+    A path ends where it leaves the envelope or the field has no orientation.
     """
     p = np.asarray(starts, float).copy()
     d, alive = field.sample(p, np.asarray(along, float))
@@ -60,7 +50,8 @@ def trace(
     for _ in range(int(np.ceil(tracing.max_length / tracing.step))):
         if not len(active):
             break
-        move = _advance(field, p, d, tracing)
+        middle, found = field.sample(p + 0.5 * tracing.step * d, d)
+        move = np.where(found[:, None], middle, d)
         q = p + tracing.step * move
         d, there = field.sample(q, move)
         good = there & (field.voxel(q) >= 0)
@@ -73,23 +64,6 @@ def trace(
     return [columns[i, :n] for i, n in enumerate(counts)]
 
 
-def _advance(field: OrientationField, p: Array, d: Array, tracing: Tracing) -> Array:
-    """The mean direction `(N, 3)` over one step from `p` where the field points along `d`."""
-
-    def ahead(move: Array) -> Array:
-        there, good = field.sample(p + move, d)
-        return np.where(good[:, None], there, d)
-
-    step = tracing.step
-    if tracing.method == "euler":
-        return d
-    k2 = ahead(0.5 * step * d)
-    if tracing.method == "midpoint":
-        return k2
-    k3 = ahead(0.5 * step * k2)
-    return (d + 2 * k2 + 2 * k3 + ahead(step * k3)) / 6
-
-
 def grow_from_roots(
     field: OrientationField,
     roots: AnyFloats,
@@ -98,15 +72,12 @@ def grow_from_roots(
     *,
     threads: int | None = None,
 ) -> list[Floats]:
-    """Strands from `roots (N, 3)`, setting out along the scalp's `normals (N, 3)`.
+    """Strands from `roots (N, 3)`, initially along the scalp's `normals (N, 3)`.
 
-    A root whose envelope stays clear of the skin is led to it along the normal, by at most 12 mm.
-    Photobooth §3.4 ends a strand at the last measured voxel that it passes; here they go on, since
-    what a strand passes inside the envelope is hair as well. Those shorter than 5 mm are not kept,
-    nor of shorter hair those under half of `max_length`.
-
-    Two thousand strands at a time on `threads` (one per core where None), so that memory grows with
-    what is kept alone; the strands do not depend on it.
+    A root up to 12 mm below the envelope is connected to it along the normal. Photobooth §3.4 ends
+    a strand at its last measured voxel; here it continues to the end of the envelope. Strands
+    shorter than 5 mm, or half of `max_length` if that is less, are dropped. The result does not
+    depend on `threads` (one per core by default).
     """
     at: Array = np.asarray(roots, np.float64)
     step = tracing.step
@@ -150,7 +121,7 @@ class Coverage:
         self.covered[n[n >= 0]] = True
 
     def share(self) -> float:
-        """Of the voxels with an orientation; 0 where there is none."""
+        """Covered share of the voxels with an orientation; 0 without any."""
         valid = self.field.valid
         return float(self.covered[valid].sum() / max(int(valid.sum()), 1))
 
@@ -168,26 +139,25 @@ def fill_gaps(
     within: float | None = None,
     batch: int = 1500,
 ) -> list[Floats]:
-    """Strands `(N, 3)` through the voxels that no strand passes, traced both ways from random ones.
+    """Strands `(N, 3)` through uncovered voxels, traced both ways from random ones.
 
-    Only voxels within `within` metres of a measured one are set out from: Photobooth §3.4 deletes
-    strands that meet nothing measured, and the volume between hair and face has no hair. None takes
-    3 mm, or two voxels where those are more. Each round starts from at most `batch` of the
-    remaining gaps, so that strands of one round cover the seeds of the next. Paths shorter than
-    10 mm, or than half of `max_length`, are not kept.
+    Seeds are voxels within `within` metres of a measured one (None: 3 mm, or two voxels if those
+    are more), as Photobooth §3.4 deletes strands that meet nothing measured. Each round starts from
+    at most `batch` of the remaining gaps. Paths shorter than 10 mm, or half of `max_length` if that
+    is less, are dropped.
     """
     rng = np.random.default_rng(seed)
     out: list[Floats] = []
-    spent = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
+    consumed = ~field.near_measured(max(3e-3, 2 * field.grid.spacing) if within is None else within)
     centers = field.grid.centers()
     shortest = min(_SHORTEST_THROUGH_GAP, tracing.max_length / 2)
     for _ in range(_ROUNDS):
         gaps = coverage.gaps()
-        gaps = gaps[~spent[gaps]]
+        gaps = gaps[~consumed[gaps]]
         if not len(gaps):
             break
         chosen = rng.choice(gaps, min(batch, len(gaps)), replace=False)
-        spent[chosen] = True
+        consumed[chosen] = True
         starts = centers[chosen] + field.grid.spacing * rng.uniform(-0.4, 0.4, (len(chosen), 3))
         d = field.directions[chosen]
         paths = trace(field, np.tile(starts, (2, 1)), np.vstack([d, -d]), tracing)

@@ -25,9 +25,9 @@ from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 
-SHELL = 12e-3  # metres under a hull's surface that what is seen there may be deep
-_BARE = 2e-3  # metres behind the head's surface up to which a pixel of skin rules hair out
-_ACROSS = 128  # voxels along the edge of the box in which hair is looked for
+SHELL = 12e-3  # metres: thickness of hair under a hull's surface
+_BARE = 2e-3  # metres behind the head's surface up to which a skin pixel excludes hair
+_ACROSS = 128  # voxels along the edge of the box in which hair is searched
 
 
 def build_envelope(
@@ -42,14 +42,13 @@ def build_envelope(
 ) -> tuple[VoxelGrid, dict[str, Array]]:
     """The volume that can hold hair, and the depth `(H, W)` of each camera's hair pixels.
 
-    `grid` is the voxels' edge, `margin` how far in front of the seen surface hair may be, and
-    `longest` how long it is, metres.
+    `grid` is the voxels' edge, `margin` how far in front of the visible surface hair may be, and
+    `longest` its length, metres.
 
-    The visual hull of everything that is not background, less the head's inside, less what a
-    camera saw through: voxels in front of a triangulated hair pixel, or on the head and in front of
-    it where the pixel shows skin. A pixel has one depth and may look past a thin wisp: where
-    triangulated points of hair stand, there is hair. Without a sweep, hair pixels carve nothing,
-    and their depth is where the ray enters the envelope.
+    The visual hull of the foreground minus the head's inside, carved by free space: voxels in front
+    of a triangulated hair pixel, or of the head where the pixel shows skin. Voxels with
+    triangulated hair points are kept. Without a sweep, hair pixels carve nothing, and their depth
+    is where the ray enters the envelope. Raises `CaptureError` if nothing is left.
     """
     masks, cameras = masked.masks, masked.cameras
     bounds = _bounds(masked, cloud, head, longest)
@@ -64,8 +63,8 @@ def build_envelope(
         depth = np.where(mask.hair, depth_map(camera, own), 0.0)
         first = np.where(mask.hair, depth, np.where(np.isfinite(bare), bare, 0.0))
         surfaces[camera.name], depths[camera.name] = first, depth
-        seen, x, y, _ = camera.pixels_of(own)
-        hairs.append(own[seen & mask.hair[y, x]])
+        visible, x, y, _ = camera.pixels_of(own)
+        hairs.append(own[visible & mask.hair[y, x]])
     carved = space_carve(hull, cameras, surfaces, margin)
     held = hull.inside & _holding(hull, np.concatenate(hairs))
     inside = (carved.inside | held) & ~inside_mesh(hull, head)
@@ -84,7 +83,7 @@ def build_envelope(
     )
     stage.leave_out(
         "voxels outside the envelope",
-        "no hair can be there",
+        "they cannot contain hair",
         f"{inside.size - int(inside.sum())} of {inside.size} unknowns",
     )
     if not inside.any():
@@ -97,18 +96,15 @@ def build_envelope(
 def build_hull(
     masked: MaskedCapture, *, grid: float, stage: Stage
 ) -> tuple[VoxelGrid, Bools, dict[str, Array]]:
-    """As `build_envelope` without sweep and head: what of the subject's hull can be hair.
+    """As `build_envelope` without sweep and head: the part of the subject's hull that can be hair.
 
-    Where skin is seen that is what is at most `SHELL` metres from where more cameras show hair than
-    skin, under the hull's surface: a head has an inside, and a face hides hair but does not carve
-    it. Also the rest of the hull's voxels `(X, Y, Z)`, and the depths `(H, W)` by camera.
-
+    If skin is visible, voxels within `SHELL` metres of those that more cameras show as hair than as
+    skin. Also the rest of the hull's voxels `(X, Y, Z)`, and the depths `(H, W)` by camera.
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
     hull = envelope = masked.subject_hull(grid)
     hair, skin = _shown(hull, masked)
     if skin.any():
-        # of a volume without any hair there is no distance to it
         near = hair.any() and ndimage.distance_transform_edt(~hair, sampling=grid) <= SHELL
         envelope = replace(hull, inside=hull.inside & near & ~skin)
     litres = 1e3 * grid**3
@@ -121,7 +117,7 @@ def build_hull(
         envelope_litres=float(envelope.inside.sum() * litres),
         voxels=int(envelope.inside.sum()),
     )
-    stage.warn("no head: what lies under the hair counts as hair, and no strand has a root")
+    stage.warn("no head: the volume under the hair counts as hair, and strands have no roots")
     depths = {
         c.name: np.where(masked.masks[c.name].hair, depth_map_first(c, envelope), 0.0)
         for c in masked.cameras
@@ -134,8 +130,8 @@ def _shown(hull: VoxelGrid, masked: MaskedCapture) -> tuple[Bools, Bools]:
     centers, votes = hull.centers(), np.zeros(int(hull.inside.sum()), np.int64)
     for camera in masked.cameras:
         mask = masked.masks[camera.name]
-        seen, x, y, depth = camera.pixels_of(centers)
-        near = seen & (depth <= first_depth(camera, hull)[y, x] + SHELL)
+        visible, x, y, depth = camera.pixels_of(centers)
+        near = visible & (depth <= first_depth(camera, hull)[y, x] + SHELL)
         votes[near] += mask.hair[y, x][near]
         votes[near] -= mask.skin[y, x][near]
     hair, skin = np.zeros((2, *hull.inside.shape), bool)
@@ -159,17 +155,15 @@ def _holding(grid: VoxelGrid, points: Array) -> Bools:
 
 def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
     """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
-    seen, x, y, depth = camera.pixels_of(envelope.centers())
+    visible, x, y, depth = camera.pixels_of(envelope.centers())
     out = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(out, (y[seen], x[seen]), depth[seen])
+    np.minimum.at(out, (y[visible], x[visible]), depth[visible])
     return np.where(np.isfinite(out), out, 0.0)
 
 
 def _bounds(masked: MaskedCapture, cloud: PointCloud, head: Mesh, longest: float) -> Array:
-    """A box `(2, 3)` that holds the hair: the points', or 12 cm about the head's upper part.
-
-    Without points also what the hull of hair and head has within `longest` metres of that part.
-    """
+    """A box `(2, 3)` around the hair: the points', or else 12 cm about the head's upper part and
+    the hull of hair and head within `longest` metres of it."""
     if len(cloud) >= 100:
         low, high = np.percentile(cloud.points, [0.1, 99.9], axis=0)
         return np.stack([low - 0.015, high + 0.015])

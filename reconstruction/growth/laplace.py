@@ -42,8 +42,7 @@ def grid_laplacian(inside: Bools) -> sparse.csr_array:
 class Multigrid:
     """One symmetric V-cycle for a symmetric positive definite matrix, as a preconditioner.
 
-    Levels come from pairwise matching along the strongest couplings done thrice (blocks of up to
-    eight unknowns), so no grid is needed; smoothing is weighted Jacobi.
+    Algebraic: three pairwise matchings a level along the strongest couplings, weighted Jacobi.
     """
 
     def __init__(self, A: sparse.csr_array) -> None:
@@ -92,7 +91,7 @@ def _match(A: sparse.csr_array) -> sparse.csr_array:
     off = sparse.coo_array(A)
     keep = off.row != off.col
     row, col, weight = off.row[keep], off.col[keep], -off.data[keep]
-    # Ties are everywhere on a grid: a fixed pseudo-random share makes the order strict.
+    # a fixed pseudo-random share breaks ties
     low, high = np.minimum(row, col).astype(np.uint64), np.maximum(row, col).astype(np.uint64)
     mixed = (low * np.uint64(0x9E3779B97F4A7C15) ^ high * np.uint64(0xC2B2AE3D27D4EB4F)) >> 40
     weight = weight * (1 + 1e-3 * mixed.astype(float) / 2**24)
@@ -141,8 +140,8 @@ def conjugate_gradients(
     """Solve `A x = b` for all columns of `b (M, K)` at once; A symmetric positive definite.
 
     Stops when every column's residual is under `tolerance` times its right-hand side's norm.
-    Returns x and the relative residual against run time. Raises `RuntimeError` where `limit`
-    iterations do not get there.
+    Returns x and the relative residual against run time. Raises `RuntimeError` after `limit`
+    iterations.
     """
     begin = time.perf_counter()
     series = Series("multigrid conjugate gradients", "relative residual")

@@ -1,9 +1,9 @@
-"""All strands together after growth: those that explain nothing new go, the rest are refined.
+"""Joint refinement after growth: strands without coverage of their own go, the rest are moved.
 
-Growth traces strands one by one: many run into one ridge of the measured lines, and none knows of
-the others. Here strands are taken by what they add to what the others explain, and those that stay
-are moved onto the measured lines by Gauss-Newton, each line drawing only the strand nearest to it.
-What is guessed moves out of the cameras' sight: they would have measured it.
+Growth traces strands independently, and many follow the same measured lines. Strands are selected
+greedily by the coverage that each adds, then moved onto the measured lines by Gauss-Newton, each
+line attracting its nearest strand. Guessed points move behind the visible surface, where the
+cameras could not have measured them.
 """
 
 from __future__ import annotations
@@ -25,26 +25,24 @@ from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
 from reconstruction.tangents.line_evidence import half_sphere
 
-REACH = 4e-3  # metres from a point up to which measured lines say anything of it
-NEAR, ALIKE_DEG = 1e-3, 10.0  # deviations at which a line says exp(-1/2) of what it says at best
-GUESS = 0.05  # what a millimetre that nothing was measured at counts; the best measured one 1
-CELL, HEADINGS = 1e-3, 24  # metres and directions: what lies in one cell explains the same
+REACH = 4e-3  # metres within which measured lines support a point
+NEAR, ALIKE_DEG = 1e-3, 10.0  # standard deviations of a line's support in metres and degrees
+GUESS = 0.05  # coverage of a millimetre without measurement; 1 with the best
+CELL, HEADINGS = 1e-3, 24  # metres and directions of a coverage cell
 
 POINT_DEVIATION = 0.5e-3  # metres of a measured line across itself
 ANGLE_DEVIATION = np.radians(30.0)
-"""Of a measured line of confidence 1: twice what it is off, as lines beside each other are read
-from the same pixels, and are off together. Followed further, they carry strands off their places.
-"""
-BEND_DEVIATION = 0.2  # per point: how the turn from one point to the next may change in all
-GUESS_DEVIATION = 3e-3  # metres that a point moves in all where nothing holds it
+"""Of a measured line of confidence 1: twice its error, as neighbouring lines' errors correlate."""
+BEND_DEVIATION = 0.2  # per point, of the change of the turn from one point to the next
+GUESS_DEVIATION = 3e-3  # metres, of the displacement of an unsupported point
 COMPATIBLE = np.cos(np.radians(35.0))
 GUESSED = 0.05  # support up to which a point is guessed
 BEHIND, BEHIND_DEVIATION = 1e-3, 1e-3
-"""Metres behind what a camera sees from which on hair is out of its sight, and how exactly."""
+"""Metres behind the visible surface at which hair is occluded, and the deviation of that."""
 
 _NEIGHBOURS = 6
 _SAMPLE = 1e-3  # metres between the points at which strands are compared
-_LARGEST_STEP = 2e-3  # metres a step, so that no strand jumps beyond what it was matched with
+_LARGEST_STEP = 2e-3  # metres a step
 
 
 class Lines:
@@ -64,8 +62,8 @@ class Lines:
     def support(self, points: AnyFloats, tangents: AnyFloats) -> Array:
         """How well a measured line agrees with each point `(N, 3)` and its tangent `(N, 3)`.
 
-        `(N,)` in [0, 1]: the confidence of the line that agrees best, less the further away it is
-        and runs; 0 where no line is within `REACH`, where all is guessed.
+        `(N,)` in [0, 1]: the largest confidence, attenuated by distance and angle; 0 without a line
+        within `REACH`.
         """
         distance, index, found = self.near(points)
         cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents))
@@ -92,26 +90,25 @@ class Guesses:
         return cls(np.flatnonzero(support < GUESSED), surfaces)
 
     def out_of_sight(self, points: AnyFloats) -> Array:
-        """The way `(G, 3)`, metres, that takes each guessed one of `points (N, 3)` out of sight.
+        """Displacement `(G, 3)`, metres, that occludes each guessed one of `points (N, 3)`.
 
-        Along the ray of the camera that asks for most, to `BEHIND` behind what it sees there; 0 for
-        what lies there already, and for what lies more than `REACH` in front, which is no part of
-        that surface.
+        Along the ray of the camera that needs the largest, to `BEHIND` behind its surface; 0 for
+        points that are there already, or more than `REACH` in front of it.
         """
         x = np.asarray(points[self.which], float)
         out, most = np.zeros_like(x), np.zeros(len(x))
         for camera, surface in self.surfaces:
-            seen, column, row, depth = camera.pixels_of(x)
+            visible, column, row, depth = camera.pixels_of(x)
             there = surface[row, column]
             front = there - depth
-            short = np.where(seen & (there > 0) & (front < REACH), front + BEHIND, 0.0)
+            short = np.where(visible & (there > 0) & (front < REACH), front + BEHIND, 0.0)
             more = short > most
             most[more] = short[more]
             out[more] = short[more, None] * unit_or_zero(x[more] - camera.center)
         return out
 
     def in_front(self, points: AnyFloats) -> float:
-        """The share of `points (N, 3)` that are guessed in front of what cameras see."""
+        """The share of `points (N, 3)` that are guessed in front of the visible surface."""
         way = np.linalg.norm(self.out_of_sight(points), axis=1)
         return float((way > BEHIND).sum()) / max(len(points), 1)
 
@@ -119,18 +116,17 @@ class Guesses:
 def refine(
     strands: Strands, measured: Measured, options: RefineOptions, surfaces: Surfaces = ()
 ) -> tuple[Strands, dict[str, Any]]:
-    """Drop the strands that explain nothing new and move the others onto the measured lines.
+    """Drop the strands that add no coverage and move the others onto the measured lines.
 
-    What is guessed moves behind the `surfaces`. Also returns JSON-ready figures on what became of
-    them. At least one line must be measured. Raises `ValueError` where no strand is worth enough to
-    stay.
+    Guessed points move behind the `surfaces`. Also returns JSON-ready figures. At least one line
+    must be measured. Raises `ValueError` where no strand adds `options.marginal_coverage`.
     """
     lines = Lines(measured)
-    kept = worthwhile(strands, lines, options.worth)
+    kept = select_by_coverage(strands, lines, options.marginal_coverage)
     if not kept.any():
         raise ValueError(
-            f"no strand adds refine.worth {options.worth:g} a millimetre to the others: take less; "
-            "0 keeps every strand"
+            f"no strand adds refine.marginal_coverage {options.marginal_coverage:g} per "
+            "millimetre: give less; 0 keeps every strand"
         )
     start = out = strands.subset(kept)
     guesses = Guesses.of(start, lines, surfaces)
@@ -159,12 +155,11 @@ def supported(strands: Strands, measured: Measured) -> Floats:
     return support.clip(0, 1).astype(np.float32)
 
 
-def worthwhile(strands: Strands, lines: Lines, worth: float) -> Bools:
-    """Which strands `(S,)` add at least `worth` a millimetre to what the others explain.
+def select_by_coverage(strands: Strands, lines: Lines, marginal_coverage: float) -> Bools:
+    """Which strands `(S,)` add at least `marginal_coverage` per millimetre.
 
-    Cells of a millimetre and some 15 degrees are worth the support of the best strand in them,
-    `GUESS` at least. The strand that adds most a millimetre is taken first, then what the others
-    add is looked at again (lazily: it only falls).
+    A cell of a millimetre and some 15 degrees is covered by the support of the best strand in it,
+    at least by `GUESS`. Lazy greedy selection: a strand's marginal coverage only falls.
     """
     dense = strands.resampled(_SAMPLE)
     tangents = dense.tangents()
@@ -185,7 +180,7 @@ def worthwhile(strands: Strands, lines: Lines, worth: float) -> Bools:
     while heap:
         _, i = heapq.heappop(heap)
         now = gain(i)
-        if now < worth:
+        if now < marginal_coverage:
             continue
         if heap and now < -heap[0][0]:
             heapq.heappush(heap, (-now, i))
@@ -213,9 +208,9 @@ def _mean_by(cells: Ints, value: Array) -> tuple[Ints, Array]:
 
 
 def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
-    """How far measured lines are from the strands: medians across (mm) and of the angle (degrees).
+    """Median distance across (mm) and angle (degrees) of measured lines to the strands.
 
-    Of the lines that a strand passes within `REACH`; `explained` is their share of all.
+    Over the lines within `REACH` of a strand; `explained` is their share.
     """
     tree = cKDTree(strands.points, balanced_tree=False, compact_nodes=False)
     distance, index = tree.query(lines.lines.points, distance_upper_bound=REACH, workers=-1)
@@ -234,14 +229,12 @@ def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
 
 
 def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: Guesses) -> Strands:
-    """All points moved at once: onto the lines, along their directions, bending little, roots kept.
+    """One Gauss-Newton step on all points; roots stay.
 
-    Residuals are linear in the points `x (N, 3)` once lines have their points, so a step is one
-    banded solve. Each line holds the strand point that is nearest to it (across the line alone);
-    each segment turns to the mean of the lines around it; guessed points move out of sight, along
-    the ray that sees them. The displacement from `start`, the same strands before the first step,
-    bends little from point to point and is held to 0: a prior on each step's own would let strands
-    drift, with directions and away from the lines, without end.
+    A banded solve over `x (N, 3)`: each line attracts its nearest strand point across itself, each
+    segment turns to the mean of the lines around it, guessed points move along the ray that sees
+    them. The total displacement from `start`, not that of the step, is smooth and small: a prior on
+    the step would let strands drift.
     """
     x = strands.points.astype(float)
     tangents = strands.tangents().astype(float)
@@ -262,7 +255,7 @@ def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: G
 
 
 def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: Array) -> None:
-    """Each line against its nearest point that runs as it does, across the line."""
+    """Each line against its nearest point of compatible tangent, across the line."""
     p, d, c = lines.lines.points, lines.lines.directions, lines.lines.confidence
     tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
     distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=REACH, workers=-1)
@@ -273,7 +266,7 @@ def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: A
     i = index[which, alike[which].argmax(axis=1)]
     across = np.eye(3) - d[which, :, None] * d[which, None, :]
     offset = np.einsum("nij,nj->ni", across, p[which] - x[i])
-    # Geman-McClure: a line that is millimetres off is another strand's
+    # Geman-McClure: lines millimetres away belong to another strand
     far = (offset**2).sum(axis=1) / (3 * POINT_DEVIATION) ** 2
     weight = c[which] / POINT_DEVIATION**2 / (1 + far) ** 2
     np.add.at(own, i, weight[:, None, None] * across)
@@ -283,7 +276,7 @@ def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: A
 def _turn_to_lines(
     x: Array, tangents: Array, lines: Lines, starts: Bools, diagonal: Array, right: Array
 ) -> None:
-    """Each segment against the mean direction of the lines around it that run as it does."""
+    """Each segment against the mean direction of the compatible lines around it."""
     i = np.flatnonzero(starts)
     step = x[i + 1] - x[i]
     length = np.linalg.norm(step, axis=1)
@@ -305,7 +298,7 @@ def _turn_to_lines(
 
 
 def _hide(x: Array, guesses: Guesses, own: Array, right: Array) -> None:
-    """Each guessed point that is in sight against where it is not, along the ray that sees it."""
+    """Each visible guessed point against its occluded position, along the ray."""
     way = guesses.out_of_sight(x)
     ray = unit_or_zero(way)
     own[guesses.which] += ray[:, :, None] * ray[:, None, :] / BEHIND_DEVIATION**2

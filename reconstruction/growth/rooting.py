@@ -1,4 +1,4 @@
-"""Strands that reach the scalp: loose ones rise from it, or join a neighbour on its way."""
+"""Rooting: loose strands are connected to the scalp, or follow a rooted neighbour to it."""
 
 from __future__ import annotations
 
@@ -11,30 +11,27 @@ from reconstruction.arrays import Array, Floats
 from reconstruction.head.scalp import Scalp
 
 _STRIDE = 4
-"""Every fourth point of a strand stands for it in the search: the growth's step is short."""
+"""Every fourth point of a strand takes part in the search."""
 
-_RISE = 1e-3  # metres between the points of a way from the scalp
+_RISE = 1e-3  # metres between the points of a connection to the scalp
 
 _NEAR, _HIGHEST = 8e-3, 40e-3
-"""Metres above the scalp: up to where an end is led down at once, and up to where at all."""
+"""Metres above the scalp up to which an end is connected at once, and at all."""
 
 _REACHES = (3e-3, 5e-3, 8e-3, 8e-3, 12e-3, 12e-3, 20e-3)
-"""Metres within which a neighbour is looked for, round by round."""
+"""Search radius for a neighbour by round, metres."""
 
 _Loose = tuple[Floats, Array]
 """A polyline, and the heights `(2,)` of its ends above the scalp."""
 
 _LEAST_COSINE = np.cos(np.radians(45.0))
-"""Of the turn from a loose strand into the neighbour that continues it."""
+"""Of the angle between a loose strand and the neighbour that continues it."""
 
 
 @dataclass(frozen=True)
 class Rooted:
-    """Strands that start on the scalp, and how loose ones got there.
-
-    `to_scalp` were led to the scalp from their lower end, `joined` run as a rooted neighbour does,
-    `dropped` found neither.
-    """
+    """Rooted strands, and how many loose ones were connected `to_scalp`, `joined` a rooted
+    neighbour or were `dropped`."""
 
     strands: list[Floats]
     to_scalp: int
@@ -43,38 +40,38 @@ class Rooted:
 
 
 def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
-    """Give every loose polyline `(N, 3)` a root; its direction in space is not changed.
+    """Give every loose polyline `(N, 3)` a root; its own points do not move.
 
-    An end within 8 mm of the scalp is led to it. Any other goes on as the nearest rooted strand
-    that continues it within 45 degrees: where the scalp is at most 40 mm below, down through the
-    hair to it, which hides what nobody measured; else beside that strand, keeping a distance that
-    fades towards its root. Strands that were joined carry others in the next round, which looks
-    further. What finds none is led down from its lower end, if the scalp is near enough.
+    An end within 8 mm of the scalp is connected to it. Others join the nearest rooted strand that
+    continues them within 45 degrees: from there directly to the scalp if that is at most 40 mm
+    below, else parallel to the strand with an offset that fades to its root. Joined strands take
+    part in the next round, with a larger radius. The rest are connected from their lower end if it
+    is at most 40 mm above the scalp, else dropped.
     """
     strands = list(rooted)
     if not loose:
         return Rooted(strands, 0, 0, 0)
     below = _Below(scalp)
-    waiting: list[_Loose] = []
+    pending: list[_Loose] = []
     for path, h in zip(loose, below.heights(_ends(loose)), strict=True):
         if h.min() > _NEAR:
-            waiting.append((path, h))
+            pending.append((path, h))
         else:
             strands.append(below.lead_lower(path, h))
     to_scalp = len(strands) - len(rooted)
     joined = 0
     for reach in _REACHES:
-        if not waiting or not strands:
+        if not pending or not strands:
             break
-        attached, waiting = _join_round(strands, waiting, reach, below)
+        attached, pending = _join_round(strands, pending, reach, below)
         joined += len(attached)
         strands += attached
-    led = [below.lead_lower(path, h) for path, h in waiting if h.min() <= _HIGHEST]
-    return Rooted(strands + led, to_scalp + len(led), joined, len(waiting) - len(led))
+    led = [below.lead_lower(path, h) for path, h in pending if h.min() <= _HIGHEST]
+    return Rooted(strands + led, to_scalp + len(led), joined, len(pending) - len(led))
 
 
 class _Below:
-    """Ways to the scalp under a strand."""
+    """Connections to the scalp below a strand."""
 
     def __init__(self, scalp: Scalp) -> None:
         self._scalp = scalp
@@ -89,10 +86,8 @@ class _Below:
         return self.lead(path if heights[0] <= heights[1] else path[::-1])
 
     def lead(self, path: Floats) -> Floats:
-        """The path with a way from the scalp before it: out along its normal, then into the path.
-
-        It rises at about 45 degrees, a cubic in Hermite's form.
-        """
+        """The path with a cubic Hermite connection from the scalp before it, which leaves along the
+        scalp's normal and rises at about 45 degrees."""
         p = path[0].astype(float)
         along = path[min(_STRIDE, len(path) - 1)] - p
         along /= max(float(np.linalg.norm(along)), 1e-12)
@@ -123,7 +118,7 @@ def _join_round(
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     owner = np.repeat(np.arange(len(strands)), counts)
     place = np.arange(len(points)) - first[owner]
-    some = np.flatnonzero((place > 0) & (place % _STRIDE == 0))  # nothing goes on below a root
+    some = np.flatnonzero((place > 0) & (place % _STRIDE == 0))  # not the roots
     if not len(some):
         return [], loose
     rootward = points[some - 1] - points[some]
@@ -158,11 +153,11 @@ def _join_round(
 
 
 def _beside(guide: Array, path: Floats) -> Floats:
-    """The path with a way to the guide's root before it, parallel to the guide where they meet."""
+    """The path with a connection to the guide's root before it, parallel to the guide."""
     offset = path[0] - guide[-1]
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1))])
     share = arc / max(arc[-1], 1e-12)
     fade = share * share * (3 - 2 * share)
     way = guide + fade[:, None] * offset
-    # the guide's last point falls on the path's first by construction
+    # the guide's last point coincides with the path's first
     return np.concatenate([way[:-1].astype(np.float32), path])

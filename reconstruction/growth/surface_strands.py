@@ -1,8 +1,7 @@
-"""Strands of the seen surface, traced through the measured lines themselves.
+"""Strands of the visible surface, traced through the measured lines without a voxel field.
 
-A voxel field blurs what it is given by a voxel; where hair turns within millimetres that is most of
-what was measured. Here a strand follows the lines around it and is drawn to their middle at every
-step, as in the mean shift on lines of Sun et al. 2021 §4.3.
+A strand follows the lines around it and moves to their centre at every step, as in the mean shift
+on lines of Sun et al. 2021 §4.3. A voxel field would blur hair that turns within millimetres.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ ANGLE_DEG, SAME_DEG = 35.0, 20.0
 PULL = 0.6
 LEAST_SUPPORT = 0.5
 
-# Strands that are traced at once, as soon as one ends another begins: few of few lines, because
-# those that begin together do not yet know which lines the others will pass.
+# Strands traced at once, at most one per so many lines: strands that start together are unaware of
+# the lines that the others will consume.
 _TOGETHER, _LINES_EACH = 500, 200
 
 
@@ -32,12 +31,11 @@ _TOGETHER, _LINES_EACH = 500, 200
 class SurfaceOptions:
     """How strands are traced through measured lines; lengths as multiples of `apart`, metres.
 
-    `apart` is about how far the lines are from one another. Those within 2.5 `BANDWIDTH`s that
-    turn by at most `ANGLE_DEG` lead a strand, at most `NEIGHBOURS` of them; every `step` it moves
-    `PULL` of the way to their middle. It ends where their confidences, each less the further
-    away, add up to less than `LEAST_SUPPORT`, and at `longest` metres. Lines closer than `spacing`
-    to one of its points that run along it within `SAME_DEG` start no other; strands shorter than
-    `shortest` are not kept, the others are smoothed along their length by a Gaussian of `smooth`.
+    `apart` is about the distance between lines. At most `NEIGHBOURS` lines within 2.5 `BANDWIDTH`s
+    and `ANGLE_DEG` guide a strand; every `step` it moves `PULL` of the way to their mean. It ends
+    where their distance-weighted confidences sum to less than `LEAST_SUPPORT`, and at `longest`
+    metres. Lines closer than `spacing` to its points and parallel within `SAME_DEG` start no other;
+    strands shorter than `shortest` are dropped, the others smoothed by a Gaussian of `smooth`.
     """
 
     apart: float = 1.25e-3
@@ -49,21 +47,21 @@ class SurfaceOptions:
 
 
 class LineCloud:
-    """Measured lines that are looked up by place and direction; `spent (N,)` are passed by."""
+    """Measured lines, looked up by place and direction; `consumed (N,)` start no strand."""
 
     def __init__(self, lines: Measured, options: SurfaceOptions) -> None:
         self._lines = lines
         self._options = options
         self._bandwidth = BANDWIDTH * options.apart
         self.step = options.step * options.apart
-        self.spent = np.zeros(len(lines.points), bool)
+        self.consumed = np.zeros(len(lines.points), bool)
         self._tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
 
     def sample(self, p: Array, along: Array) -> tuple[Array, Array, Array]:
-        """Unit directions `(N, 3)`, ways to the lines' middle `(N, 3)` across them, support `(N,)`.
+        """Mean directions `(N, 3)`, offsets `(N, 3)` to the lines across them, support `(N,)`.
 
-        Of the lines around `p (N, 3)` that run as `along (N, 3)` does; that itself where none does.
-        Lines right beside them that run alike are spent, where the support is enough to go on.
+        Over the lines around `p (N, 3)` within `ANGLE_DEG` of `along (N, 3)`, which is returned if
+        there are none. Adjacent parallel lines are consumed if the support suffices.
         """
         k = min(NEIGHBOURS, len(self._lines.points))
         distance, index = self._tree.query(
@@ -87,15 +85,12 @@ class LineCloud:
         middle -= np.einsum("ni,ni->n", middle, mean)[:, None] * mean
         row, column = np.nonzero(beside)
         alike = np.abs(np.einsum("ni,ni->n", d[row, column], mean[row]))
-        self.spent[index[row, column][alike >= np.cos(np.radians(SAME_DEG))]] = True
+        self.consumed[index[row, column][alike >= np.cos(np.radians(SAME_DEG))]] = True
         return mean, middle, support
 
 
 class _Pool:
-    """`size` strands in the making at most, both ways from where each began.
-
-    Way k and way `size` + k are one strand's: ahead and back.
-    """
+    """Up to `size` strands in progress; ways k and `size` + k are the two directions of one."""
 
     def __init__(self, cloud: LineCloud, options: SurfaceOptions, size: int) -> None:
         self._cloud, self._size, ways = cloud, size, 2 * size
@@ -107,7 +102,7 @@ class _Pool:
         self.busy = np.zeros(size, bool)
 
     def begin(self, starts: Array, along: Array) -> None:
-        """Set out from `starts (N, 3)` along `along (N, 3)`; N places at least must be free."""
+        """Start at `starts (N, 3)` along `along (N, 3)`; at least N slots must be free."""
         k = np.flatnonzero(~self.busy)[: len(starts)]
         self.busy[k] = True
         for ways, sign in ((k, 1.0), (k + self._size, -1.0)):
@@ -117,7 +112,7 @@ class _Pool:
             self._goes[ways] = self._most > 0
 
     def step(self) -> list[Array]:
-        """Take one step everywhere; returns the paths `(N, 3)` that have ended on both sides."""
+        """Advance all ways by one step; returns the paths `(N, 3)` that ended on both sides."""
         ways = np.flatnonzero(self._goes)
         mean, middle, support = self._cloud.sample(self._p[ways], self._d[ways])
         good = support >= LEAST_SUPPORT
@@ -141,10 +136,7 @@ class _Pool:
 def surface_strands(
     lines: Measured, options: SurfaceOptions = SurfaceOptions(), *, seed: int = 0
 ) -> list[Floats]:
-    """Polylines `(N, 3)` through measured lines, both ways from lines that none passes yet.
-
-    Lines are taken in an order drawn by `seed`, a new one whenever a strand has ended.
-    """
+    """Polylines `(N, 3)` through measured lines, both ways from unconsumed ones in random order."""
     if not len(lines.points):
         return []
     cloud = LineCloud(lines, options)
@@ -154,18 +146,18 @@ def surface_strands(
     while len(order) or pool.busy.any():
         free = int((~pool.busy).sum())
         if free and len(order):
-            chosen, order = _next(order, cloud.spent, free)
-            cloud.spent[chosen] = True
+            chosen, order = _next(order, cloud.consumed, free)
+            cloud.consumed[chosen] = True
             pool.begin(lines.points[chosen], lines.directions[chosen])
         found += [p for p in pool.step() if (len(p) - 1) * options.step >= options.shortest]
     return [p.astype(np.float32) for p in smoothed(found, options.smooth * options.apart)]
 
 
-def _next(order: Ints, spent: Bools, count: int) -> tuple[Ints, Ints]:
-    """The first `count` lines of `order (N,)` that are not `spent`, and what comes after them."""
+def _next(order: Ints, consumed: Bools, count: int) -> tuple[Ints, Ints]:
+    """The first `count` lines of `order (N,)` that are not `consumed`, and the rest of `order`."""
     chosen: list[Ints] = []
     while count > 0 and len(order):
         some, order = order[:count], order[count:]
-        chosen.append(some[~spent[some]])
+        chosen.append(some[~consumed[some]])
         count -= len(chosen[-1])
     return np.concatenate(chosen or [order]), order

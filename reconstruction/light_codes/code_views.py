@@ -1,4 +1,4 @@
-"""What line stereo looks at: every camera's lines, lightcodes, and who sees what."""
+"""Input of line stereo: every camera's lines and lightcodes, and its neighbours."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from reconstruction.reconstruct_options import LogGaborBank
 from reconstruction.report.report import Progress, Stage, silent
 
 BESIDE_DEG = 5.0
-"""Degrees, seen from the subject, within which a light counts as standing beside a camera."""
+"""Degrees, from the subject, within which a light counts as beside a camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """One camera's hair: `mask (H, W)`, `lines (H, W, 2)` and lightcodes.
 
-    A line is its confidence times (cos θ, sin θ); its sign means nothing, and it is 0 outside the
-    mask. `beside` is the number of the light that stands beside the camera, -1 where none does.
+    A line is its confidence times (cos θ, sin θ), of arbitrary sign, and 0 outside the mask.
+    `beside` is the number of the light beside the camera, -1 without one.
     """
 
     camera: Camera
@@ -51,7 +51,7 @@ def line_vectors(angle: ArrayLike, confidence: ArrayLike) -> Floats:
 
 
 def light_beside(camera: Camera, lights: Sequence[Light], subject: ArrayLike = (0, 0, 0)) -> int:
-    """The light that stands where the camera does as seen from `subject (3,)`, else -1."""
+    """The light in the direction of the camera from `subject (3,)`, else -1."""
     center = np.asarray(subject, float)
     to = camera.center - center
     away = np.stack([x.position for x in lights]) - center
@@ -62,11 +62,7 @@ def light_beside(camera: Camera, lights: Sequence[Light], subject: ArrayLike = (
 
 
 def nearest_views(views: Sequence[View], subject: ArrayLike, count: int) -> list[list[int]]:
-    """For each view, the other views by their angle to it as seen from `subject (3,)`.
-
-    Nearest first, at most `count` of them, and none that stands more than a right angle away:
-    they see the other side.
-    """
+    """For each view, at most `count` others within 90° of it at `subject (3,)`, nearest first."""
     to = np.stack([v.camera.center for v in views]) - np.asarray(subject, float)
     to /= np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-12)
     cosine = to @ to.T
@@ -86,9 +82,8 @@ def views_of(
 ) -> list[View]:
     """A view for each camera with hair on its mask `hair[name] (H, W)`.
 
-    Lights are weighed so that each gives the same irradiance at `subject (3,)`, metres. Reports how
-    many lights vary, thresholds, and which cameras no light stands beside. Raises `CaptureError`
-    without single-light frames, or where fewer than two cameras see hair under them.
+    Frames are scaled to equal irradiance at `subject (3,)`, metres. Raises `CaptureError` without
+    single-light frames, or if fewer than two cameras see hair under them.
     """
     stage = stage or Stage("lightcodes")
     names = capture.olat_lights()
@@ -97,7 +92,7 @@ def views_of(
     cameras = [c for c in capture.rig.cameras if c.name in hair and hair[c.name].any()]
     unlit = [c.name for c in cameras if not any(capture.has_light(n, c.name) for n in names)]
     if unlit:
-        stage.warn(f"{', '.join(unlit)}: no frame of a single light; left out of line stereo")
+        stage.warn(f"{', '.join(unlit)}: no frame of a single light; not used by line stereo")
         cameras = [c for c in cameras if c.name not in unlit]
     if len(cameras) < 2:
         raise CaptureError(
@@ -118,13 +113,13 @@ def views_of(
     )
     if alone:
         stage.warn(
-            f"no light stands beside {alone}: whether they see a pixel is not known from its "
-            "lightcode, only from where they stand"
+            f"no light is beside {alone}: their visibility comes from their position, not from "
+            "lightcodes"
         )
     if not any(v.codes.varying.any() for v in views):
         stage.warn(
-            "no light tells one hair pixel from another: lightcodes match everywhere, and depths "
-            "come from lines alone"
+            "all lightcodes are equal, so depths come from lines alone: add single lights that "
+            "shadow parts of the hair"
         )
     if not any((v.confidence > 0).any() for v in views):
         raise CaptureError(
@@ -154,8 +149,8 @@ def _view(
         irradiance /= float(((light.position - at) ** 2).sum())
         if irradiance <= 0:
             raise CaptureError(
-                f"{capture.path}: the light {name} sends nothing towards {at.tolist()}: check its "
-                "intensity and aim in rig.json"
+                f"{capture.path}: the light {name} has no intensity towards {at.tolist()}: check "
+                "its intensity and aim in rig.json"
             )
         images[i] = grey(image) / irradiance
     noise = noise_of_frames(images[shot])

@@ -19,11 +19,10 @@ class CodeMap:
     """One view's lightcodes.
 
     `words (H, W, ceil(L / 32)) uint32` hold light `i` in bit `i % 32` of word `i // 32`, 0 outside
-    the mask. `varying (words,)` marks the lights whose bit is not the same all over the hair: the
-    others say nothing within this view. `threshold` is the response at which a pixel counts as
-    lit, `noise` the part of it that the sensor's noise asked for. `reached`, packed alike, marks
-    the lights of which anything arrives: by reciprocity, what stands beside them sees the pixel.
-    `shot (words,)` marks the lights of which there is a frame: of the others nothing is known.
+    the mask. `varying (words,)` marks the lights whose bit varies over the hair. `threshold` is the
+    response from which a pixel counts as lit, `noise` the sensor's. `reached`, packed alike, marks
+    the lights of which any light arrives: by reciprocity, a camera beside them sees the pixel.
+    `shot (words,)` marks the lights that have a frame.
     """
 
     words: Words
@@ -50,29 +49,23 @@ def unpack(words: Words, count: int) -> Bools:
     return np.unpackbits(raw, axis=-1, bitorder="little", count=count).astype(bool)
 
 
-def match(a: Words, b: Words, asked: Words) -> Floats:
-    """Share of equal bits among those `asked`: `(...)` of `(..., W)` words; 1 where none is."""
-    equal = np.bitwise_count(~(a ^ b) & asked).sum(axis=-1, dtype=np.int64)
-    total = np.bitwise_count(asked).sum(axis=-1, dtype=np.int64)
+def match(a: Words, b: Words, compared: Words) -> Floats:
+    """Share of equal bits among those `compared`: `(...)` of `(..., W)` words; 1 without any."""
+    equal = np.bitwise_count(~(a ^ b) & compared).sum(axis=-1, dtype=np.int64)
+    total = np.bitwise_count(compared).sum(axis=-1, dtype=np.int64)
     share = np.divide(equal, total, out=np.ones(np.broadcast(equal, total).shape), where=total > 0)
     return share.astype(np.float32)
 
 
-LEAST_LIT = 0.1  # of the median pixel's brightest light: what a shadow lets through is below
+LEAST_LIT = 0.1  # of the median pixel's brightest light: above light in shadow
 
 LEAST_REACHED = 0.02
-"""Of what a light brings to the brightest twentieth of the hair.
-
-One threshold for all lights takes shading for shadow: where hair scatters a light away from the
-camera, what stands beside that light counted as hidden though it sees the pixel.
-"""
+"""Of a light's 95th percentile on the hair; a common threshold would take shading for shadow."""
 
 
 def along_lines(images: Floats, angle: AnyFloats, half: int = 4) -> Floats:
-    """Means of `images (L, H, W)` over `half` pixels to both sides along the line at each pixel.
-
-    Shadows run along strands for some millimetres, noise does not; across a strand they change.
-    """
+    """Means of `images (L, H, W)` over `half` pixels to both sides along the line at each pixel:
+    shadows extend along strands, noise does not."""
     y, x = np.mgrid[: angle.shape[0], : angle.shape[1]]
     total = np.zeros_like(images)
     for k in range(-half, half + 1):
@@ -92,13 +85,11 @@ def code_map(
 ) -> CodeMap:
     """Lightcodes from responses `(L, H, W)` to single lights of equal irradiance on the subject.
 
-    A pixel is lit where it exceeds the median over the mask `(H, W)` under light `furthest`, the
-    one furthest from the camera, which shows what a shadow looks like; and three times `noise`,
-    the responses' standard deviation; and `LEAST_LIT`, where the head itself stands before that
-    light and its median is next to nothing. It is reached by a light that brings it `LEAST_REACHED`
-    and more than the noise. `saturated (L, H, W)` pixels are both whatever their value. `shot (L,)`
-    says of which lights there is a frame (all): the others' bits are 0. Raises `ValueError` where
-    shapes disagree.
+    A pixel is lit above the median over the mask `(H, W)` under light `furthest`, the one furthest
+    from the camera (a shadow), above three times `noise`, the responses' standard deviation, and
+    above `LEAST_LIT`. It is reached by a light above `LEAST_REACHED` and the noise. `saturated (L,
+    H, W)` pixels are both. Bits are 0 for lights without a frame, `shot (L,)`, by default all have
+    one. Raises `ValueError` where shapes disagree.
     """
     if responses.ndim != 3 or responses.shape[1:] != mask.shape:
         raise ValueError(f"expected responses (L, {mask.shape}), got {responses.shape}")

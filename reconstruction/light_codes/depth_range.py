@@ -1,4 +1,4 @@
-"""Between which depths a pixel's hair can lie: the hull of what the cameras see, and the head."""
+"""The range of depths of a pixel's hair, from the visual hull and the head."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ def hair_volume(
 ) -> VoxelGrid:
     """Voxels that can hold hair: in the hull of the masks `(H, W)` of the subject, off the head.
 
-    `spacing` is the voxels' edge in metres. A point that three views cannot see is of no use to
-    line stereo; with two cameras, two do.
+    `spacing` is the voxels' edge in metres. Line stereo needs points in three views, or two of two.
     """
     used = {c.name: subject[c.name] for c in cameras if subject[c.name].any()}
     hull = visual_hull(cameras, used, spacing=spacing, least_views=3)
@@ -32,9 +31,9 @@ def hair_volume(
 
 
 def depth_range(camera: Camera, volume: VoxelGrid) -> tuple[Floats, Floats]:
-    """Nearest and furthest depth `(H, W)` of the volume behind each pixel, both 0 where none is.
+    """Nearest and furthest depth `(H, W)` of the volume behind each pixel, both 0 without any.
 
-    At most `DEEPEST` metres apart: hair deeper under the volume's surface is not seen.
+    At most `DEEPEST` metres apart.
     """
     near = np.zeros((camera.height, camera.width), np.float32)
     centers = volume.centers()
@@ -43,7 +42,7 @@ def depth_range(camera: Camera, volume: VoxelGrid) -> tuple[Floats, Floats]:
     pixels, depth = pixels[ok], depth[ok]
     if not len(depth):
         return near, near.copy()
-    # tiles as large as a voxel's picture: none is missed between the voxels' centres
+    # tiles as large as a voxel's projection leave no gaps between the voxels' centres
     focal = max(camera.K[0, 0], camera.K[1, 1])
     tile = max(1, int(np.ceil(focal * volume.spacing / float(depth.min()))))
     shape = -(-camera.height // tile) + 2, -(-camera.width // tile) + 2

@@ -1,4 +1,4 @@
-"""The views as flat arrays on Dr.Jit's device, and what a point in space finds in one of them."""
+"""The views as flat arrays on Dr.Jit's device, and their samples at points in space."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _UNIT = 32767.0  # a line's two numbers are kept as 16-bit fractions
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What one view shows where a point falls on it; all zero off its hair.
+class ViewSample:
+    """One view at the projection of a point; all zero off its hair.
 
     `x`, `y` pixels; `lx`, `ly` the line there, its length the confidence; `equal` the share of the
-    asked lights' bits that equal the reference's; `there` whether the pixel is on the image.
+    compared lights' bits that equal the reference's; `there` whether the pixel is on the hair.
     """
 
     x: Any
@@ -86,8 +86,8 @@ class DeviceViews:
             *(row[k] * line.x + row[4 + k] * line.y + row[8 + k] * line.z for k in range(3))
         )
 
-    def asked(self, view: Any, reference: Any) -> list[Any]:
-        """The lights by which a pair of views is compared, as words: those shot in both."""
+    def compared_lights(self, view: Any, reference: Any) -> list[Any]:
+        """Words of the lights that vary in either view and have a frame in both."""
         u = self.types.UInt32
 
         def both(words: Any) -> tuple[Any, Any]:
@@ -102,12 +102,12 @@ class DeviceViews:
         width, height, offset = (dr.gather(u, self.geometry, 3 * view + k) for k in range(3))
         return width, height, offset
 
-    def look(
-        self, frame: tuple[Any, Any, Any], asked: list[Any], code: list[Any], h: Any, active: Any
-    ) -> Seen:
-        """What the view with `corner` `frame` shows at homogeneous pixels `h`, beside `code`.
+    def sample(
+        self, frame: tuple[Any, Any, Any], compared: list[Any], code: list[Any], h: Any, active: Any
+    ) -> ViewSample:
+        """The view with `corner` `frame` at homogeneous pixels `h`, compared with `code`.
 
-        Without words that are `asked`, nothing is compared and all bits count as equal.
+        Without `compared` words all bits count as equal.
         """
         t = self.types
         width, height, offset = frame
@@ -122,8 +122,8 @@ class DeviceViews:
         ly = t.Float(t.Int32(packed) >> 16) * (1 / _UNIT)
         there &= packed != 0
         same, total = t.UInt32(0), t.UInt32(0)
-        for words, a, c in zip(self.words, asked, code, strict=False):
+        for words, a, c in zip(self.words, compared, code, strict=False):
             same += dr.popcnt(~(dr.gather(t.UInt32, words, index, there) ^ c) & a)
             total += dr.popcnt(a)
         equal = dr.select(total > 0, t.Float(same) / dr.maximum(t.Float(total), 1), 1)
-        return Seen(x, y, lx, ly, dr.select(there, equal, 0), there)
+        return ViewSample(x, y, lx, ly, dr.select(there, equal, 0), there)

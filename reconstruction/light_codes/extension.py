@@ -12,7 +12,7 @@ from reconstruction.light_codes.code_views import View
 STEP = 5e-4  # metres
 ANGLE_DEG = 5.0  # within which a view's line agrees with a strand
 LONGEST = 0.05  # metres that grow at most from either tip
-LEAST_CONFIDENCE = 0.05  # of a view's line for it to have a say
+LEAST_CONFIDENCE = 0.05  # of a view's line to take part
 
 
 def fewest_views(count: int) -> int:
@@ -23,11 +23,10 @@ def fewest_views(count: int) -> int:
 def extend(
     views: Sequence[View], strands: list[Array], angle_deg: float = ANGLE_DEG
 ) -> list[Array]:
-    """The polylines `(N, 3)` with what grows at both of their tips.
+    """The polylines `(N, 3)`, extended at both tips.
 
-    At a tip, the views in which the strand's direction runs along the line under it give the new
-    direction (Eq. 4 over these); the strand goes on one step that way, and ends where too few are
-    left.
+    The views whose line agrees with the strand's direction at a tip give the next direction
+    (Eq. 4); the strand ends where fewer than `fewest_views` agree.
     """
     if not strands:
         return []
@@ -56,7 +55,7 @@ def _grow(views: Sequence[View], tips: Array, heading: Array, angle_deg: float) 
         matrix = np.einsum("nv,nvi,nvj->nij", aligned[going], normals[going], normals[going])
         new = np.linalg.eigh(matrix)[1][:, :, 0]
         new *= np.where((new * d).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-        straight = (new * d).sum(axis=1) > 0.9  # nearly parallel planes leave the direction open
+        straight = (new * d).sum(axis=1) > 0.9  # else planes are nearly parallel
         d = np.where(straight[:, None], new, d)
         p = p + STEP * d
         columns.append((active, p))

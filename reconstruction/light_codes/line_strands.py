@@ -1,4 +1,4 @@
-"""Strands from line stereo alone, and its part in the fusion with light planes."""
+"""Polylines from line stereo, and their fusion with measured tangents."""
 
 from __future__ import annotations
 
@@ -29,17 +29,16 @@ from reconstruction.tangents.estimate import Measured
 VOLUME_GRID = 4e-3  # metres: the voxels in which depths are bounded
 
 SUPPORT_DISTANCE, SUPPORT_ANGLE_DEG = 1.5e-3, 15.0
-"""Metres and degrees within which two views found a segment alike."""
+"""Metres and degrees within which the segments of two views agree."""
 
 CROWD = 3e-4
 """Metres: lines are averaged in cells of this size before strands are traced through them."""
 
 MOST_LINES = 1_000_000
-"""More are averaged in larger cells, and strands are traced as much further apart: those of large
-pictures would take hours."""
+"""More are averaged in larger cells, and strands traced further apart, to bound run time."""
 
 SEGMENT_WEIGHT = 4.0
-"""Of a segment's confidence, in an orientation field that it shares with measured tangents."""
+"""Factor on segments' confidence in an orientation field shared with measured tangents."""
 
 TRACING = SurfaceOptions(apart=6e-4, shortest=5.0, smooth=2.0)
 
@@ -65,8 +64,8 @@ def build_views(
             raise CaptureError(f"{capture.path}: no volume for hair: {error}") from error
         if not volume.inside.any():
             raise CaptureError(
-                f"{capture.path}: no volume is seen by enough cameras: check masks, head.obj and "
-                "poses"
+                f"{capture.path}: no volume is visible in enough cameras: check masks, head.obj "
+                "and poses"
             )
         center = volume.centers().mean(axis=0)
         views = views_of(capture, hair, center, options.bank, stage, progress)
@@ -81,7 +80,7 @@ def _depth_maps(
     options: LightCodeOptions,
     progress: Progress,
 ) -> list[DepthMap]:
-    """What the search finds in each view; adds the stage `depth` to the report."""
+    """Depth maps of all views; adds the stage `depth` to the report."""
     with report.stage("depth") as stage:
         kind = DepthSearch if method == "photometric" else LmvsSearch
         search = kind(views, volume.centers().mean(axis=0), options.search)
@@ -89,11 +88,11 @@ def _depth_maps(
         for k, view in enumerate(views):
             progress("searching depths", k / len(views))
             maps.append(search.run(k, *depth_range(view.camera, volume)))
-        seen = np.concatenate([m.seen_by for m in maps])
+        visible = np.concatenate([m.visible_count for m in maps])
         stage.figures.update(
             segments={v.camera.name: len(m.x) for v, m in zip(views, maps, strict=True)},
             reference_pixels={v.camera.name: int(v.mask.sum()) for v in views},
-            visible_neighbours=float(seen.mean()) if len(seen) else 0.0,
+            visible_neighbours=float(visible.mean()) if len(visible) else 0.0,
         )
         for name in ("agreement", "spread", "misfit"):
             stage.figures[name] = _percentiles(np.concatenate([getattr(m, name) for m in maps]))
@@ -103,7 +102,7 @@ def _depth_maps(
 def _agreed_segments(
     views: list[View], maps: list[DepthMap], least: int, report: Report, path: Path
 ) -> Segments:
-    """Those that `least` views agree on; adds the stage `segments` to the report."""
+    """Segments that `least` views agree on; adds the stage `segments` to the report."""
     with report.stage("segments") as stage:
         segments = count_supports(
             views,
@@ -121,17 +120,16 @@ def _agreed_segments(
         )
         if not len(kept):
             raise CaptureError(
-                f"{path}: no segment of {len(segments)} is found alike in {least} of {len(views)} "
-                "views: more cameras with overlapping views, sharper or finer pictures, or a lower "
-                "least_views may help"
+                f"{path}: no segment of {len(segments)} agrees in {least} of {len(views)} views: "
+                "add cameras with overlapping views, use sharper or larger images, or lower "
+                "light_codes.least_views"
             )
     return kept
 
 
 def connect_segments(views: list[View], segments: Segments, report: Report) -> list[Array]:
-    """Polylines `(N, 3)` through the segments, with what grows from their tips."""
+    """Polylines `(N, 3)` through the segments, extended at their tips."""
     with report.stage("connection") as stage:
-        # of the segments that ten views agree on, three times as many are right as of those of four
         weights = (segments.confidence * segments.supports) ** 2
         points, directions, weights = thinned_lines(
             segments.points, segments.directions, weights, CROWD
@@ -167,12 +165,11 @@ def line_strands(
     options: LightCodeOptions = LightCodeOptions(),
     progress: Progress = silent,
 ) -> tuple[list[AnyFloats], Segments]:
-    """Polylines `(N, 3)` from line stereo, the end that is nearer to the head first.
+    """Unrooted polylines `(N, 3)` from line stereo, see `roots_first`, and their segments.
 
-    Without a head it is the higher end. None of them is rooted. Also the segments that they come
-    from: those that `least_views` of the views (all, if there are fewer) agree on. Adds the stages
-    `lightcodes`, `depth`, `segments` and `connection` to the report. Raises `CaptureError` where
-    there are no two views of hair, or no segment is left.
+    At least `least_views` of the views (all, if there are fewer) agree on a segment. Adds the
+    stages `lightcodes`, `depth`, `segments` and `connection` to the report. Raises `CaptureError`
+    for fewer than two views of hair, or if no segment is left.
     """
     views, volume = build_views(masked, head, report, options=options, progress=progress)
     maps = _depth_maps(views, volume, report, method, options, progress)
@@ -182,7 +179,7 @@ def line_strands(
 
 
 def merge(measured: Measured, segments: Segments, weight: float = 1.0) -> Measured:
-    """The measurements of both methods; segments count `weight` times their confidence."""
+    """The lines of both methods; segments' confidences are multiplied by `weight`."""
     return Measured(
         np.concatenate([measured.points, segments.points]),
         np.concatenate([measured.directions, segments.directions]),

@@ -1,8 +1,7 @@
 """The baseline: line stereo without lightcodes, after Nam et al. 2019 as Sun §4 describes it.
 
-Depth and direction are both unknown and searched together; the cost is the angle between projected
-and seen lines, minimised over the nearest cameras whether or not they see the pixel. As in other
-multi-view stereo without visibility, the better half of the cameras counts.
+Depth and direction are searched together; the cost is the angle between projected and observed
+lines over the better half of the nearest cameras, as visibility is unknown.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from reconstruction.light_codes.objective import Pixels, line_through
 from reconstruction.light_codes.search import LENGTH, SAMPLES, DepthSearch, fetched
 
 FAN = np.radians(np.linspace(-50, 50, 5))
-"""Inclinations towards the camera at which a line is tried at every depth."""
+"""Inclinations towards the camera that are tried at every depth."""
 
 COARSE_SAMPLES, COARSE_NEIGHBOURS = 3, 6
 ROUNDS = 3
@@ -30,7 +29,7 @@ class LmvsSearch(DepthSearch):
     """Searches depth and inclination; same inputs and outputs as `DepthSearch`."""
 
     def visible(self, view: int, y: Ints, x: Ints) -> Bools:
-        """All neighbours `(P, N)`: nothing says which of them see a pixel."""
+        """All neighbours `(P, N)`."""
         return np.ones((len(x), len(self.neighbours[view])), bool)
 
     def search(
@@ -38,7 +37,7 @@ class LmvsSearch(DepthSearch):
     ) -> tuple[Any, ...]:
         """As `DepthSearch.search`; the agreement `(P,)` is 1 less the cost over a right angle."""
         t = self.types
-        pixels.code = []  # this method knows no lightcode: nothing is compared, all is equal
+        pixels.code = []  # no lightcodes: all count as equal
         along = self._in_plane(view, x, y)
         near, number = t.Float(for_kernels(start)), t.UInt32(for_kernels(counts, np.uint32))
         step, samples = dr.opaque(t.Float, self.steps[view]), dr.opaque(t.UInt32, SAMPLES)
@@ -109,11 +108,11 @@ class _Cost:
             angle = t.Float(0)
             s = t.UInt32(0)
             while s < samples:
-                seen = views.look(frame, [], [], h, t.Bool(True))
-                ux, uy = step.x - seen.x * step.z, step.y - seen.y * step.z
-                norm = (ux * ux + uy * uy) * (seen.lx * seen.lx + seen.ly * seen.ly)
-                cosine = dr.abs(ux * seen.lx + uy * seen.ly) * dr.rsqrt(dr.maximum(norm, 1e-20))
-                angle += dr.select(seen.there, dr.acos(dr.minimum(cosine, 1)), np.pi / 2)
+                at = views.sample(frame, [], [], h, t.Bool(True))
+                ux, uy = step.x - at.x * step.z, step.y - at.y * step.z
+                norm = (ux * ux + uy * uy) * (at.lx * at.lx + at.ly * at.ly)
+                cosine = dr.abs(ux * at.lx + uy * at.ly) * dr.rsqrt(dr.maximum(norm, 1e-20))
+                angle += dr.select(at.there, dr.acos(dr.minimum(cosine, 1)), np.pi / 2)
                 h += step
                 s += 1
             here = angle / t.Float(samples)

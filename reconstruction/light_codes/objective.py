@@ -1,6 +1,6 @@
-"""What a depth is worth: the line through a point and how well all views agree with it (Sun §4.2).
+"""The objective of a depth: the line through a point and the agreement of all views (Sun §4.2).
 
-Written once for Dr.Jit's CPU and GPU back ends. `reference` in the tests is the same in numpy.
+For Dr.Jit's CPU and GPU back ends; `reference` in the tests is the same in NumPy.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from reconstruction.light_codes.device_views import DeviceViews
 MATCH_POWER, ANGLE_POWER = 1, 64
 """Powers of the share of equal bits and of the cosine in the objective.
 
-Sun's Eq. 5 has the cosine itself, which two lines drawn at random have 0.64 of: at 64, lines 8
-degrees apart count half. Its confidence W is left out: with it, pixels between bright strands are
-drawn to these, and fewer of the strands behind are found.
+Sun's Eq. 5 has power 1, at which random lines average 0.64; at 64, lines 8 degrees apart count
+half. Its confidence W is left out: it draws pixels between bright strands to these.
 """
 
 LINE_MATCH_POWER = 16
-"""Of the share of equal bits, in a view's weight for the direction: other codes, other strands."""
+"""Of the share of equal bits, in a view's weight for the direction."""
 
 
 def power(x: Any, n: int) -> Any:
@@ -75,10 +74,8 @@ class Line:
 def line_through(views: DeviceViews, pixels: Pixels, point: Any) -> Line:
     """The direction that lies in the planes of the visible views' lines (Sun Eq. 4).
 
-    The singular vector of the smallest singular value of the planes' normals, weighted by how well
-    the lightcodes match, as an eigenvector of a 3x3 matrix. Then once more, weighted by how well
-    each line agrees with that direction too: least squares alone follow the views that see
-    something else there.
+    The singular vector of the least singular value of the plane normals, weighted by the match of
+    lightcodes; then reweighted by each line's agreement with it, against outliers.
     """
     zero = views.types.Array3f(0, 0, 0)
     first = _weighed_line(views, pixels, point, zero, 0)
@@ -87,7 +84,7 @@ def line_through(views: DeviceViews, pixels: Pixels, point: Any) -> Line:
 
 @dr.syntax
 def _weighed_line(views: DeviceViews, pixels: Pixels, point: Any, along: Any, trust: int) -> Line:
-    """The direction where a line `trust`s in the cosine between it and `along`, to that power."""
+    """The direction, lines weighted by their cosine to `along` to the power `trust`."""
     t = views.types
     xx, yy, zz = t.Float(0), t.Float(0), t.Float(0)
     xy, xz, yz = t.Float(0), t.Float(0), t.Float(0)
@@ -96,18 +93,18 @@ def _weighed_line(views: DeviceViews, pixels: Pixels, point: Any, along: Any, tr
         view = dr.gather(t.UInt32, pixels.neighbours, n)
         sees = (pixels.visible >> n) & 1 == 1
         h = views.projection(view, point, 1)
-        asked = views.asked(view, pixels.view)
-        seen = views.look(views.corner(view), asked, pixels.code, h, sees)
-        line = t.Array3f(-seen.ly, seen.lx, seen.x * seen.ly - seen.y * seen.lx)
+        compared = views.compared_lights(view, pixels.view)
+        at = views.sample(views.corner(view), compared, pixels.code, h, sees)
+        line = t.Array3f(-at.ly, at.lx, at.x * at.ly - at.y * at.lx)
         normal = views.across(view, line)
         square = dr.squared_norm(normal)
         weight = dr.select(
-            seen.there & (square > 0),
-            power(seen.equal, LINE_MATCH_POWER) / dr.maximum(square, 1e-30),
+            at.there & (square > 0),
+            power(at.equal, LINE_MATCH_POWER) / dr.maximum(square, 1e-30),
             0,
         )
         if trust > 0:
-            cosine2 = seen.cosine2(views.projection(view, along, 0))
+            cosine2 = at.cosine2(views.projection(view, along, 0))
             weight *= power(cosine2, trust // 2)
         xx += weight * normal.x * normal.x
         yy += weight * normal.y * normal.y
@@ -125,7 +122,7 @@ def smallest_axis(t: Any, diagonal: Triple, beside: Triple) -> Line:
     The matrix has `diagonal` (xx, yy, zz) and `beside` it (xy, xz, yz), lane by lane.
 
     Eigenvalues by the trigonometric formula, the vector as the longest cross product of two rows
-    of A - λI, refined by nothing: errors are of the order of float32's rounding over `spread`².
+    of A - λI: errors are of the order of float32's rounding over `spread`².
     """
     trace = diagonal[0] + diagonal[1] + diagonal[2]
     scale = dr.maximum(trace, 1e-30)
@@ -168,14 +165,14 @@ def agreement(views: DeviceViews, pixels: Pixels, point: Any, along: Any, sample
         sees = (pixels.visible >> n) & 1 == 1
         middle = views.projection(view, point, 1)
         step = views.projection(view, along, 0)
-        asked = views.asked(view, pixels.view)
+        compared = views.compared_lights(view, pixels.view)
         frame = views.corner(view)
         h = middle - 0.5 * (t.Float(samples) - 1) * step
         s = t.UInt32(0)
         while s < samples:
-            seen = views.look(frame, asked, pixels.code, h, sees)
-            share = power(seen.cosine2(step), ANGLE_POWER // 2) * power(seen.equal, MATCH_POWER)
-            total += dr.select(seen.there, share, 0)
+            at = views.sample(frame, compared, pixels.code, h, sees)
+            share = power(at.cosine2(step), ANGLE_POWER // 2) * power(at.equal, MATCH_POWER)
+            total += dr.select(at.there, share, 0)
             h += step
             s += 1
         terms += dr.select(sees, t.Float(samples), 0)

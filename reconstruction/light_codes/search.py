@@ -20,29 +20,28 @@ from reconstruction.light_codes.objective import Line, Pixels, agreement, line_t
 from reconstruction.reconstruct_options import SearchOptions
 
 FEW_SAMPLES = 3
-"""Points of a segment in the first stage. Sun's compares lightcodes alone there, which change too
-little from one strand to the next: its best 24 depths of 160 held the best in 88 % of pixels."""
+"""Points of a segment in the first stage; Sun's compares lightcodes alone there."""
 
 SAMPLES, LENGTH = 13, 5e-3
-"""Points of a segment that are compared in the second stage, and metres from its end to its end."""
+"""Points of a segment in the second stage, and its length in metres."""
 
 STEP_PIXELS = 5 / 3
-"""Pixels that a step is at most as wide as: coarser ones pass by the best depth."""
+"""Largest step between depths, pixels."""
 
 AROUND, FEWEST, LEFT_OUT, BEYOND = 2, 8, 0.1, 1.5e-3
-"""Of the lattice: pixels to every side of one that tell its depths, how few tell nothing, the share
-of the nearest and of the furthest of them that is left out, and metres beyond the others."""
+"""Of the lattice: radius of the window that bounds a pixel's depths, fewest depths in it, share
+trimmed at either end, and metres added to the rest."""
 
-LEAST_CONFIDENCE = 0.1  # of a pixel's line for it to be a reference
-LEAST_SPREAD = 0.05  # segments whose planes spread less are dropped as nearly parallel
+LEAST_CONFIDENCE = 0.1  # of a reference pixel's line
+LEAST_SPREAD = 0.05  # of a segment's planes, else they are nearly parallel
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What the search found in one view, over its pixels `(P,)`, the reference pixels.
+    """Depths of one view's reference pixels `(P,)`.
 
     `x`, `y` integers; `depth` along the camera's axis, metres; `direction (P, 3)`; `agreement` in
-    [0, 1]; `spread` and `misfit` as in `objective.Line`; `seen_by` counts the visible neighbours.
+    [0, 1]; `spread` and `misfit` as in `objective.Line`; `visible_count` of the neighbours.
     """
 
     x: Ints
@@ -52,7 +51,7 @@ class DepthMap:
     agreement: Floats
     spread: Floats
     misfit: Floats
-    seen_by: Ints
+    visible_count: Ints
 
 
 class DepthSearch:
@@ -75,8 +74,7 @@ class DepthSearch:
     def visible(self, view: int, y: Ints, x: Ints) -> Bools:
         """Which neighbours see the pixels `(P, N)`: a light beside them reaches the pixel.
 
-        A neighbour without a light beside it, or without a frame of that light, is taken to see
-        what it stands near to.
+        A neighbour without a frame of such a light is assumed to see them.
         """
         own = self.views[view]
         words = own.codes.reached[y, x]
@@ -112,35 +110,35 @@ class DepthSearch:
     def run(self, view: int, near: Floats, far: Floats) -> DepthMap:
         """Search the reference pixels of `view` between depths `near` and `far (H, W)`, metres.
 
-        Where `far` is not above `near` there is nothing to search, as off the mask.
+        Pixels with `far` <= `near` are skipped.
         """
         own = self.views[view]
-        asked = own.mask & (own.confidence >= LEAST_CONFIDENCE) & (far > near)
+        wanted = own.mask & (own.confidence >= LEAST_CONFIDENCE) & (far > near)
         apart = self.options.lattice
         if apart == 1:
-            return self._among(view, asked, near, far)
-        lattice = np.zeros_like(asked)
+            return self._among(view, wanted, near, far)
+        lattice = np.zeros_like(wanted)
         lattice[apart // 2 :: apart, apart // 2 :: apart] = True
-        first = self._among(view, asked & lattice, near, far)
+        first = self._among(view, wanted & lattice, near, far)
         nearer, further = narrowed(first, near, far, apart)
-        rest = self._among(view, asked & ~lattice, nearer, further)
+        rest = self._among(view, wanted & ~lattice, nearer, further)
         return DepthMap(
             *(np.concatenate([getattr(m, f.name) for m in (first, rest)]) for f in fields(DepthMap))
         )
 
-    def _among(self, view: int, asked: Bools, near: Floats, far: Floats) -> DepthMap:
-        """Search the pixels that are `asked (H, W)`."""
-        y, x = np.nonzero(asked)
+    def _among(self, view: int, wanted: Bools, near: Floats, far: Floats) -> DepthMap:
+        """Search the pixels `wanted (H, W)`."""
+        y, x = np.nonzero(wanted)
         if not len(x) or not self.neighbours[view]:
             none, no = np.zeros(0, np.int64), np.zeros(0, np.float32)
             return DepthMap(none, none, no, np.zeros((0, 3), np.float32), no, no, no, none)
-        pixels, seen_by = self.pixels(view, y, x)
+        pixels, visible_count = self.pixels(view, y, x)
         start = near[y, x].astype(np.float32)
         counts = np.ceil((far[y, x] - start) / self.steps[view]).astype(np.uint32) + 1
         found = self.search(pixels, x, y, start, counts, view)
         _, _, agree, spread, _ = found
-        keep = (seen_by > 0) & (spread >= LEAST_SPREAD) & (agree > 0)
-        return DepthMap(*(a[keep] for a in (x, y, *found, seen_by)))
+        keep = (visible_count > 0) & (spread >= LEAST_SPREAD) & (agree > 0)
+        return DepthMap(*(a[keep] for a in (x, y, *found, visible_count)))
 
     def search(
         self, pixels: Pixels, x: Any, y: Any, start: Floats, counts: NDArray[np.uint32], view: int
@@ -154,24 +152,17 @@ class DepthSearch:
         step = dr.opaque(t.Float, self.steps[view])
         fine = _Depths(self.device, pixels, near, step, SAMPLES, LENGTH / (SAMPLES - 1))
         if options.candidates:
-            every, coarse = options.coarse, (number + options.coarse - 1) // options.coarse
-            apart = LENGTH / FEW_SAMPLES
-            wide = _Depths(self.device, pixels, near, every * step, FEW_SAMPLES, apart)
-            steps = best_of_all(wide, coarse, options.candidates)[1]
-            between = range(1 - every, every)
-            steps = [
-                t.UInt32(dr.maximum(t.Int32(k * every) + j, 0)) for k in steps for j in between
-            ]
-            score, best = best_of(fine, steps)
+            wide = _Depths(self.device, pixels, near, step, FEW_SAMPLES, LENGTH / FEW_SAMPLES)
+            score, best = best_of(fine, best_of_all(wide, number, options.candidates)[1])
         else:
             (score,), (best,) = best_of_all(fine, number, 1)
         dr.eval(score, best)
         depth = near + step * t.Float(best)
-        before, after = fine.worth(depth - step)[0], fine.worth(depth + step)[0]
+        before, after = fine.agreement_at(depth - step)[0], fine.agreement_at(depth + step)[0]
         bend = before - 2 * score + after
         shift = dr.select(bend < 0, 0.5 * (before - after) / dr.minimum(bend, -1e-12), 0)
         depth += step * dr.clip(shift, -0.5, 0.5)
-        agree, line = fine.worth(depth)
+        agree, line = fine.agreement_at(depth)
         return fetched(depth, line.direction, agree, line)
 
 
@@ -182,11 +173,10 @@ def step_of(camera: Camera, subject: Any, options: SearchOptions) -> float:
 
 
 def narrowed(found: DepthMap, near: Floats, far: Floats, apart: int) -> tuple[Floats, Floats]:
-    """Where to search the pixels between those of a lattice: `near` and `far (H, W)`, narrower.
+    """`near` and `far (H, W)`, narrowed to the depths `found` on a lattice of spacing `apart`.
 
-    `found` is of every `apart`th pixel both ways. A pixel's hair lies between the depths that most
-    of the lattice's pixels around it have, give or take `BEYOND`; where fewer than `FEWEST` have
-    one, between `near` and `far` as they are.
+    Trimmed range of the lattice's depths around a pixel, plus `BEYOND`; unchanged where fewer than
+    `FEWEST` are known.
     """
     shape = -(-near.shape[0] // apart), -(-near.shape[1] // apart)
     depths = np.full(shape, np.nan, np.float32)
@@ -219,9 +209,9 @@ def fetched(depth: Any, direction: Any, agreement: Any, line: Line) -> tuple[Any
 
 
 class _Depths:
-    """Depths of the `pixels`: number k is `near + k step`. No dataclass, as `Pixels` is none.
+    """Depths of the `pixels`: number k is `near + k step`; no dataclass, as `Pixels`.
 
-    Segments are compared by `samples` points, `apart` metres from one to the next.
+    Segments are compared at `samples` points, `apart` metres apart.
     """
 
     def __init__(
@@ -232,16 +222,16 @@ class _Depths:
         self.samples = dr.opaque(self.types.UInt32, samples)
         self.apart = dr.opaque(self.types.Float, apart)
 
-    def worth(self, depth: Any) -> tuple[Any, Any]:
+    def agreement_at(self, depth: Any) -> tuple[Any, Any]:
         """The agreement at `depth` and the line that has it."""
         point = self.pixels.at(depth)
         line = line_through(self.device, self.pixels, point)
         along = self.apart * line.direction
         return agreement(self.device, self.pixels, point, along, self.samples), line
 
-    def worth_of(self, number: Any) -> Any:
-        """The agreement at the depth of this number."""
-        return self.worth(self.near + self.step * self.types.Float(number))[0]
+    def agreement_of(self, number: Any) -> Any:
+        """The agreement at a depth by its number."""
+        return self.agreement_at(self.near + self.step * self.types.Float(number))[0]
 
 
 @dr.syntax
@@ -252,7 +242,7 @@ def best_of_all(depths: _Depths, number: Any, count: int) -> tuple[list[Any], li
     steps = [t.UInt32(0) for _ in range(count)]
     k = t.UInt32(0)
     while k < number:
-        here = depths.worth_of(k)
+        here = depths.agreement_of(k)
         moved = k
         for i in range(count):  # insertion into the sorted list, without a branch
             better = here > scores[i]
@@ -280,7 +270,7 @@ def _best_listed(depths: _Depths, table: Any, width: Any, count: int) -> tuple[A
     i = t.UInt32(0)
     while i < count:
         k = dr.gather(t.UInt32, table, i * width + lane)
-        here = depths.worth_of(k)
+        here = depths.agreement_of(k)
         better = here > score
         score = dr.select(better, here, score)
         best = dr.select(better, k, best)

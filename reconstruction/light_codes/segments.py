@@ -1,4 +1,4 @@
-"""Line segments in space, one for each pixel, and which of them other views confirm (Sun §4.3)."""
+"""Line segments in space, one for each pixel, and their support by other views (Sun §4.3)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _NONE = 2**32 - 1  # the number of no segment
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """`points (N, 3)`, unit `directions (N, 3)` whose sign means nothing, and their origin.
+    """`points (N, 3)` and unit `directions (N, 3)` of arbitrary sign.
 
-    `confidence (N,)` in [0, 1] is the agreement of the views; `view (N,)` numbers the view that
-    each was found in, `supports (N,)` counts the views that agree with it, its own among them.
+    `confidence (N,)` in [0, 1] is the agreement of the views; `view (N,)` the view of origin,
+    `supports (N,)` the number of views that agree, its own included.
     """
 
     points: Array
@@ -63,10 +63,10 @@ def count_supports(
     distance: float = 1e-3,
     angle_deg: float = 10.0,
 ) -> Segments:
-    """The segments with the number of views that agree: each counts itself and others like it.
+    """The segments with their `supports`.
 
-    Another view agrees where it found, within a pixel of where it would see the segment, one of
-    its own within `distance` metres and `angle_deg` of it.
+    Another view agrees if it has a segment within `distance` metres and `angle_deg`, at most a
+    pixel from the projection.
     """
     if not len(segments):
         return segments
@@ -98,12 +98,12 @@ def count_supports(
         corner = t.UInt32(y) * row + t.UInt32(x)
         agrees = t.Bool(False)
         for dy, dx in np.ndindex(3, 3):
-            asked = sees & ~agrees
-            j = dr.gather(t.UInt32, of_pixel, corner + dy * row + dx, asked)
-            asked &= j != _NONE
-            away = dr.squared_norm(dr.gather(t.Array3f, points, j, asked) - p)
-            cosine = dr.abs(dr.dot(dr.gather(t.Array3f, directions, j, asked), d))
-            agrees |= asked & (away <= near) & (cosine >= like)
+            tested = sees & ~agrees
+            j = dr.gather(t.UInt32, of_pixel, corner + dy * row + dx, tested)
+            tested &= j != _NONE
+            away = dr.squared_norm(dr.gather(t.Array3f, points, j, tested) - p)
+            cosine = dr.abs(dr.dot(dr.gather(t.Array3f, directions, j, tested), d))
+            agrees |= tested & (away <= near) & (cosine >= like)
         supports += dr.select(agrees, t.UInt32(1), t.UInt32(0))
         dr.eval(supports)
     return replace(segments, supports=np.array(supports).astype(np.int64))
@@ -112,10 +112,9 @@ def count_supports(
 def thinned_lines(
     points: Array, directions: Array, weights: Array, spacing: float
 ) -> tuple[Array, Array, Array]:
-    """One line for each cell of `spacing` metres and each of its main directions.
+    """Weighted mean lines for each cell of `spacing` metres and largest direction component.
 
-    Lines of a cell are averaged with those whose largest component is the same: points `(M, 3)`,
-    directions `(M, 3)` and summed weights `(M,)`.
+    Points `(M, 3)`, directions `(M, 3)` and summed weights `(M,)`.
     """
     if not len(points):
         return points, directions, weights

@@ -23,10 +23,10 @@ class Motion:
     between               what holds between tracking frames: "interpolate" (rotation on SO(3),
                           translation linearly) suits people, "hold" a subject that only moves at
                           tracking frames
-    still                 nothing moved by more than the noise of the measurement
+    still                 no motion above the noise of the measurement
     determined            directions of motion, of 6, that the cameras determine (the least)
-    lost (L,)             `Step.index` of tracking frames whose pose could not be found: nothing is
-                          known from the tracking frame before each to the one after it
+    lost (L,)             `Step.index` of tracking frames without a pose: the motion is unknown
+                          from the tracking frame before each to the one after it
     """
 
     steps: Ints
@@ -69,7 +69,7 @@ class Motion:
         return np.asarray(rotations), np.stack(columns, axis=1)
 
     def known(self, steps: ArrayLike) -> Bools:
-        """Whether the pose at the steps `(N,)` is known: no lost tracking frame has a say in it."""
+        """Whether the pose at the steps `(N,)` is known: it depends on no lost tracking frame."""
         index = np.asarray(steps, np.int64).reshape(-1)
         if not len(self.lost):
             return np.ones(len(index), bool)

@@ -1,7 +1,7 @@
 """Space-time analysis of a scanline sweep (Curless and Levoy 1995; Photobooth §3.1).
 
-A sweep is read from disk one frame at a time. For every pixel the strongest temporal maxima are
-kept with the few frames around them, so memory does not grow with the number of scanlines.
+A sweep is streamed from disk. For every pixel the strongest temporal maxima are kept with the
+frames around them, so that memory does not grow with the number of scanlines.
 """
 
 from __future__ import annotations
@@ -18,28 +18,27 @@ from reconstruction.images.silhouettes import background_noise, dark_frame
 
 REACH = 3  # frames kept before and after a maximum
 WINDOW = 2 * REACH + 1
-CLEAN = 0.1  # rows: what a stripe's centre is off by even without noise, on fibres of many depths
+CLEAN = 0.1  # rows: error of a stripe's centre without noise, on fibres of many depths
 
 
 NOISE_FACTOR, FAINTEST = 6.0, 0.01
-"""A maximum stands so many deviations above the dark frame, and reaches this share of the camera's
-bright maxima (95th percentile)."""
+"""Least height of a maximum, in deviations of the dark frame and as a share of the camera's bright
+maxima (95th percentile)."""
 
 DIRECT_SHARE = 0.15
-"""Of all the light that the sweep brings to the pixel: indirect light comes from every row."""
+"""Least share of the pixel's light over the sweep: indirect light comes from every row."""
 
 CORRELATION = 0.9  # of a stripe with the projector's line profile
-PER_PIXEL = 2  # maxima that are kept: hair lets a ray hit several fibres
+PER_PIXEL = 2  # maxima: a ray may hit several fibres
 
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Stripes that one camera saw of one projector, one entry for each.
+    """Stripes of one projector in one camera, one entry for each.
 
-    pixel (N, 2) int (x, y); row (N,) fractional row; deviation (N,) of the row from noise and from
-    depths mixed in the pixel, rows; brightness (N,) of the maximum; step (N,) `Step.index` of the
-    frame with the maximum; saturated (N,) whether a frame at the maximum was at full scale.
-    Of all frames' `bright` pixels, `side_responses` are at no temporal maximum.
+    pixel (N, 2) int (x, y); row (N,) fractional row; deviation (N,) of the row, rows; brightness
+    (N,) of the maximum; step (N,) `Step.index` of its frame; saturated (N,) whether a frame at the
+    maximum was at full scale. Of all frames' `bright` pixels, `side_responses` are at no maximum.
     """
 
     camera: str
@@ -59,7 +58,7 @@ class Peaks:
 def find_peaks(capture: Capture, camera: str, projector: str) -> Peaks:
     """Read one camera's frames of one projector's sweep in row order and locate its stripes.
 
-    A maximum next to a frame that is missing is not used. `KeyError` for unknown names.
+    Maxima next to a missing frame are ignored. `KeyError` for unknown names.
     """
     device = capture.rig.projector(projector)
     capture.rig.camera(camera)
@@ -98,10 +97,10 @@ def find_peaks(capture: Capture, camera: str, projector: str) -> Peaks:
 def fit_stripes(window: Array, projector: Projector, noise: float) -> tuple[Array, ...]:
     """Fit the projector's line profile on a constant to `window (N, 7)` about each maximum.
 
-    Least squares over the stripe's centre (searched, then refined by a parabola), its extra width
-    (depths mixed in one pixel), its height and the constant. Returns the centre `(N,)` relative to
-    the middle frame in rows, its standard deviation `(N,)`, the correlation of window and profile
-    `(N,)` in [0, 1], and the light `(N,)` of the stripe summed over rows.
+    Least squares over centre (grid, then a parabola), extra width (depths mixed in one pixel),
+    height and constant. Returns the centre `(N,)` relative to the middle frame in rows, its
+    standard deviation `(N,)`, the correlation of window and profile `(N,)` in [0, 1], and the
+    stripe's light `(N,)` summed over rows.
     """
     centres = np.linspace(-1.25, 1.25, 51)
     n = len(window)
@@ -127,7 +126,7 @@ def fit_stripes(window: Array, projector: Projector, noise: float) -> tuple[Arra
         light = np.where(better, height, light)
         by_centre = np.linalg.norm(np.gradient(profile, centres, axis=0), axis=1)
         gradient = np.where(better, height * by_centre[i], gradient)
-    # a residual that noise does not explain is a profile that was not quite right
+    # residuals above the noise are errors of the profile
     misfit = energy * np.sqrt(np.maximum(1 - best**2, 0) / (WINDOW - 3))
     error = np.maximum(noise, 0.5 * misfit)
     random = np.where(gradient > error, error / np.where(gradient > 0, gradient, 1.0), 1.0)
@@ -150,13 +149,13 @@ def _bright(value: Floats) -> float:
 
 
 class _Tally:
-    """How many of many values lie above a floor that is known only afterwards, to a hundredth."""
+    """Counts values above a floor that is known only afterwards, to a hundredth."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(1 << 15, np.int64)
 
     def add(self, values: Floats) -> None:
-        # the upper half of a positive float32: its exponent and seven bits more
+        # the upper half of a positive float32: the exponent and seven bits
         positive = values[values > 0].view(np.uint32) >> 16
         self._counts += np.bincount(positive, minlength=len(self._counts))
 
@@ -191,7 +190,8 @@ class Scan:
         return float(np.median(self._noises)) if self._noises else 0.0
 
     def push(self, row: int) -> None:
-        """Read the frame of `row` (dark beyond the projector's edge); look at the one behind it."""
+        """Read the frame of `row` (dark beyond the projector's edge) and process a maximum there
+        may be `REACH` rows before."""
         shape = self.total.shape
         image, clipped, held = np.zeros(shape, np.float32), np.zeros(shape, bool), True
         if 0 <= row < self.rows:
@@ -221,7 +221,7 @@ class Scan:
         return image, saturated
 
     def _insert(self, middle: int) -> None:
-        """Keep the middle frame's maxima where they beat the weakest that a pixel has."""
+        """Keep the middle frame's maxima where they exceed the weakest of the pixel."""
         before, now, after = (self.ring[REACH + k] for k in (-1, 0, 1))
         highest = (now > before) & (now >= after)
         self.maxima.add(now[highest])

@@ -14,7 +14,7 @@ from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig
 
-GRAZING = 0.1  # cosine to the surface under which a sphere's point is not counted as seen or lit
+GRAZING = 0.1  # least cosine to the surface of a visible or lit point of the sphere
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class PairConditioning:
 
 @dataclass(frozen=True)
 class RigConditioning:
-    """Every pair, and what the pairs do together.
+    """Conditioning of every pair, and of all together.
 
-    `seen` is the share of the sphere's surface that some camera sees, `triangulated` the part of
-    that which a pair with an angle of at least `well_deg` covers, `well_pairs` the share of the
+    `visible` is the share of the sphere's surface visible in some camera, `triangulated` the part
+    of it that a pair with an angle of at least `well_deg` covers, `well_pairs` the share of the
     pairs with a common part of over 2 % of the sphere whose median angle is at least `well_deg`.
     """
 
     pairs: tuple[PairConditioning, ...]
-    seen: float
+    visible: float
     triangulated: float
     well_pairs: float
     well_deg: float
@@ -56,8 +56,8 @@ class RigConditioning:
 def ray_plane_angles(camera: Camera, projector: Projector, points: ArrayLike) -> Array:
     """Angles `(N,)` in [0, π/2] between the camera's rays to `points (N, 3)` and the planes.
 
-    The plane of a point is that of the (fractional) row that lights it. Near 0 the depth along the
-    ray is worthless: its deviation grows with 1 / sin(angle).
+    The plane of a point is that of the (fractional) row that lights it. The deviation of the depth
+    along the ray grows with 1 / sin(angle).
     """
     points = np.asarray(points, float).reshape(-1, 3)
     rays = points - camera.center
@@ -71,16 +71,15 @@ def row_pitch(projector: Projector, points: ArrayLike) -> Array:
     points = np.asarray(points, float).reshape(-1, 3)
     y = (points @ projector.R.T + projector.t)[:, 1:]
     # the plane turns by d(atan y/z) per row about the projector's x axis
-    slope = y[:, 0] / y[:, 1]
-    return np.asarray(np.linalg.norm(y, axis=1) / (projector.K[1, 1] * (1 + slope**2)))
+    tangent = y[:, 0] / y[:, 1]
+    return np.asarray(np.linalg.norm(y, axis=1) / (projector.K[1, 1] * (1 + tangent**2)))
 
 
 def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigConditioning:
     """Conditioning of every camera with every projector on a sphere of `radius` metres.
 
-    Self-shadowing is the sphere's own: a point counts where it faces both devices and lies in both
-    pictures. Raises `ValueError` for a rig without projectors, which has nothing to triangulate,
-    and for a radius of 0 or less.
+    A point counts where it faces both devices and lies in both images. Raises `ValueError` for a
+    rig without projectors and for a radius of 0 or less.
     """
     if not 0 < radius < np.inf:
         raise ValueError(f"a sphere needs radius > 0 m, got {radius:g}")
@@ -96,12 +95,12 @@ def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigC
         return np.asarray((cosine > GRAZING) & (depth > 0) & device.inside(pixels))
 
     lit = {p.name: faces(p) for p in rig.projectors}
-    pairs, covered, seen = [], np.zeros(len(points), bool), np.zeros(len(points), bool)
+    pairs, covered, visible = [], np.zeros(len(points), bool), np.zeros(len(points), bool)
     for camera in rig.cameras:
-        visible = faces(camera)
-        seen |= visible
+        here = faces(camera)
+        visible |= here
         for projector in rig.projectors:
-            both = visible & lit[projector.name]
+            both = here & lit[projector.name]
             angle = np.degrees(ray_plane_angles(camera, projector, points[both]))
             covered[both] |= angle >= well_deg
             shift = row_pitch(projector, points[both]) / np.sin(np.radians(np.maximum(angle, 0.1)))
@@ -119,8 +118,8 @@ def condition(rig: Rig, *, radius: float = 0.12, well_deg: float = 25.0) -> RigC
     used = [p.median_angle_deg for p in pairs if p.shared > 0.02 and p.median_angle_deg is not None]
     return RigConditioning(
         tuple(pairs),
-        float(seen.mean()),
-        float(covered.sum() / max(int(seen.sum()), 1)),
+        float(visible.mean()),
+        float(covered.sum() / max(int(visible.sum()), 1)),
         float(np.mean([a >= well_deg for a in used])) if used else 0.0,
         well_deg,
     )

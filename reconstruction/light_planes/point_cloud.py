@@ -1,4 +1,4 @@
-"""Points on hair and skin, each with the ray that saw it and how well it is known."""
+"""Triangulated points on hair and skin, with their rays and covariances."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class PointCloud:
 
     points (N, 3)         float64, metres
     covariance (N, 3, 3)  float64, m²: along the ray from row and angle, across from the pixel
-    view (N, 3)           float64, unit direction from the point to the camera that saw it
-    pixel (N, 2)          int32, (x, y) in that camera's image at the time of the step: a subject
-                          that moved is elsewhere in the reference frame, project the point for that
+    view (N, 3)           float64, unit direction from the point to its camera
+    pixel (N, 2)          int32, (x, y) in that camera's image at the time of the step, not in the
+                          reference pose
     camera (N,)           int16, index into `cameras`
     projector (N,)        int16, index into `projectors`
     row (N,)              float32, fractional row of the projector at the temporal maximum
     step (N,)             int32, `Step.index` of the frame with the maximum
     brightness (N,)       float32, response at the maximum, mean of the channels, W/(sr m²)
-    weight (N,)           float32 in (0, 1], 1 for a point as well conditioned as any: the squared
-                          ratio of the best attainable deviation along the ray to this point's
+    weight (N,)           float32 in (0, 1]: the squared ratio of the best attainable deviation
+                          along the ray to this point's
 
     Raises `ValueError` when shapes disagree or a coordinate is not finite.
     """
@@ -84,7 +84,7 @@ class PointCloud:
         return PointCloud(**columns, cameras=self.cameras, projectors=self.projectors)
 
     def of_camera(self, name: str) -> PointCloud:
-        """The points that the camera called `name` saw."""
+        """The points of the camera `name`."""
         return self.subset(self.camera == self.cameras.index(name))
 
     def deviation_along_view(self) -> Array:

@@ -1,4 +1,4 @@
-"""Sub-pixel rigid registration of two pictures of one camera (Photobooth Eq. 1)."""
+"""Sub-pixel rigid registration of two images of one camera (Photobooth Eq. 1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Array, Bools
 
-BLUR = 1.0  # pixels of the Gaussian that keeps pictures from aliasing
+BLUR = 1.0  # pixels of the Gaussian against aliasing
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +35,16 @@ class Registration:
 
 
 class Template:
-    """A reference picture prepared once, against which many others are registered.
+    """A reference image `(H, W)`, prepared for registration of others over `mask (H, W)`.
 
-    `image (H, W)` is smoothed by a Gaussian of `BLUR` pixels against aliasing; `mask (H, W)` says
-    which pixels count. Raises `ValueError` for an empty mask or a picture without any detail.
+    Raises `ValueError` for an empty mask or an image without detail.
     """
 
     def __init__(self, image: AnyFloats, mask: Bools) -> None:
         if image.shape != mask.shape or image.ndim != 2:
             raise ValueError(f"image {image.shape} and mask {mask.shape} must be the same (H, W)")
         if not mask.any():
-            raise ValueError("the registration mask is empty: no pixel of the subject to follow")
+            raise ValueError("the registration mask is empty")
         self.mask = mask
         self.raw = np.asarray(image, np.float64)
         self.image = smooth(image, BLUR)
@@ -55,20 +54,17 @@ class Template:
         self.lever = float(max(np.sqrt(np.mean(dx**2 + dy**2)), 1.0))
         gx, gy = (g[mask] for g in gradients(self.image))
         self.values = self.image[mask]
-        # the last column is the picture's gain: lamps and shading may change a little
+        # the last column is the image's gain
         self.jacobian = np.stack([gx, gy, gy * dx - gx * dy, self.values], axis=1)
         scale = np.linalg.norm(self.jacobian, axis=0)
         normal = self.jacobian.T @ self.jacobian
         if scale.min() <= 0 or np.linalg.cond(normal / np.outer(scale, scale)) > 1e8:
-            raise ValueError("the picture has no detail inside the mask to register by")
+            raise ValueError("the image has no detail inside the mask")
         self.inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
 
     def register(self, image: AnyFloats, *, iterations: int = 30) -> Registration:
-        """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004).
-
-        Until steps are under 0.001 pixel. One iteration gives the linear estimate, which
-        suffices to see that nothing moved.
-        """
+        """Register `image (H, W)` by inverse compositional Gauss-Newton (Baker and Matthews 2004),
+        until steps are under 0.001 pixel."""
         other = spline(smooth(image, BLUR))
         shift, angle, gain, converged = np.zeros(2), 0.0, 1.0, False
         error = np.zeros_like(self.values)
@@ -80,7 +76,7 @@ class Template:
             error = sample(other, u, v) / gain - self.values
             step = self.inverse @ (self.jacobian.T @ error)
             gain *= 1 + float(np.clip(step[3], -0.5, 0.5))
-            # compose with the inverse of the step that moves the reference onto the warped picture
+            # compose with the inverse of the step that moves the reference onto the warped image
             step = -step
             angle += step[2]
             c, s = np.cos(angle), np.sin(angle)
@@ -88,7 +84,7 @@ class Template:
             if max(np.abs(step[:2]).max(), abs(step[2]) * self.lever) < 1e-3:
                 converged = True
                 break
-        # smoothing correlates neighbours: only one in 4 pi sigma² residuals is independent
+        # smoothing correlates neighbours: one in 4 pi sigma² residuals is independent
         correlated = max(1.0, 4 * np.pi * BLUR**2)
         variance = float(error @ error) / max(len(error) - 4, 1) * correlated
         deviation = np.sqrt(np.maximum(np.diag(self.inverse)[:3] * variance, 0))
@@ -104,10 +100,7 @@ def smooth(image: AnyFloats, sigma: float) -> Array:
 
 
 def gradients(image: Array) -> tuple[Array, Array]:
-    """Derivatives by x and y `(H, W)`, fourth-order central differences.
-
-    Second-order differences read a pattern of 6 pixels a sixth too flat.
-    """
+    """Derivatives by x and y `(H, W)`, fourth-order central differences."""
     kernel = np.array([1, -8, 0, 8, -1]) / 12.0
     gx = cv2.filter2D(image, cv2.CV_64F, kernel[None], borderType=cv2.BORDER_REPLICATE)
     gy = cv2.filter2D(image, cv2.CV_64F, kernel[:, None], borderType=cv2.BORDER_REPLICATE)
@@ -117,8 +110,7 @@ def gradients(image: Array) -> tuple[Array, Array]:
 def spline(image: Array) -> Array:
     """Coefficients `(H, W)` of the cubic spline through `image`, for `sample`.
 
-    OpenCV's four-tap cubic is off by 4 % of a pattern of 12 pixels and rounds positions to 1/32
-    pixel, which biases a registration by a twentieth of a pixel.
+    OpenCV rounds positions to 1/32 pixel, which biases a registration by a twentieth of a pixel.
     """
     return np.asarray(ndimage.spline_filter(image, order=3, mode="nearest"))
 

@@ -1,4 +1,4 @@
-"""Rigid motions by Gauss-Newton steps: robust, and still where nothing determines them."""
+"""Robust rigid motions by Gauss-Newton; undetermined directions stay at the start."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from reconstruction.geometry.cameras import Camera
 
 Pose = tuple[Array, Array]
 WEAKEST = 0.02
-"""Directions whose singular value is below this share of the largest are not determined."""
+"""Share of the largest singular value below which a direction is undetermined."""
 
-LEVER = 0.1  # metres: rotations count by what they move at this distance, so that units agree
+LEVER = 0.1  # metres: rotations are scaled to displacements at this distance
 
 
 @dataclass(frozen=True, eq=False)
 class Determination:
     """How well a solve determined its six directions of motion.
 
-    `strength (6,)` are the singular values of its derivatives over the largest, smallest first, and
+    `strength (6,)` are the singular values of its derivatives over the largest, ascending,
     `directions (6, 6)` their columns: a turn about the world's origin times `LEVER`, then a shift.
-    Directions weaker than `WEAKEST` were left as they were.
     """
 
     strength: Array
@@ -36,12 +35,12 @@ class Determination:
         return int((self.strength > WEAKEST).sum())
 
     def named(self, count: int) -> list[str]:
-        """The `count` weakest directions in words."""
+        """Descriptions of the `count` weakest directions."""
         return [_in_words(d) for d in self.directions.T[:count]]
 
     @property
     def missing(self) -> list[str]:
-        """The directions that are not determined, in words."""
+        """Descriptions of the undetermined directions."""
         return self.named(6 - self.rank)
 
 
@@ -58,7 +57,7 @@ def _in_words(direction: Array) -> str:
 def gauss_newton(
     system: Callable[[Pose], tuple[Array, Array]], iterations: int, start: Pose | None = None
 ) -> tuple[Pose, Determination]:
-    """Minimise Huber's loss over rigid motions; directions that are not determined stay put.
+    """Minimise Huber's loss over rigid motions; undetermined directions do not change.
 
     `system(pose)` gives the residuals (M,) and their derivatives (M, 6) by a turn times `LEVER` and
     a shift, both applied after the pose.
@@ -98,7 +97,7 @@ def numeric(residual: Callable[[Pose], Array], pose: Pose) -> Array:
 
 
 def flow(gradient: Array, camera: Camera, points: Array, depth: Array) -> Array:
-    """How a picture of `gradient (N, 2)` at `points (N, 3)` changes `(N, 6)` by a rigid step."""
+    """Derivative `(N, 6)` of an image of `gradient (N, 2)` at `points (N, 3)` by a rigid step."""
     local = points @ camera.R.T + camera.t
     z = np.where(depth > 0, depth, 1.0)
     x, y = local[:, 0] / z, local[:, 1] / z

@@ -1,10 +1,9 @@
-"""The motion solve: tracking frames of all cameras give one rigid motion each.
+"""The motion solve: one rigid motion for each tracking frame, from all cameras.
 
-Two methods share one linear core. "registered" is the paper's: a 2D rigid registration per camera
-(Eq. 1), then the 3D motion that explains them (Eq. 2), here with the 2D rotation as a third
-equation. "direct" aligns the pictures of all cameras at once by warping the triangulated points:
-it starts from the registered motion, or from that of the tracking frame before where pictures are
-more alike in that, and uses every pixel instead of three numbers a camera.
+"registered" is Photobooth's: a 2D rigid registration per camera (Eq. 1), then the 3D motion that
+explains them (Eq. 2), with the 2D rotation as a third equation. "direct" aligns the images of all
+cameras at once by warping the triangulated points, from the registered motion or that of the
+tracking frame before, whichever correlates better.
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from reconstruction.light_planes.rigid_fit import Determination, Pose, flow, gau
 from reconstruction.reconstruct_options import MotionOptions
 from reconstruction.report.report import Progress, Stage, silent
 
-SIGMA = 1.5  # pixels of the Gaussian under which pictures are compared
-ALIKE = 0.6  # likeness under which a tracking frame does not show what the reference shows
+SIGMA = 1.5  # pixels of the Gaussian before images are compared
+ALIKE = 0.6  # correlation below which a tracking frame is lost
 
 
-STILL_PX = 0.03  # motions under this, or within the noise of all cameras together, are none
-MOST_POINTS = 12000  # points of a camera that take part
+STILL_PX = 0.03  # smaller motions, or those within the noise of all cameras together, are none
+MOST_POINTS = 12000  # points of a camera
 
 STILL: Pose = (np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
 class _TrackedView:
-    """One camera's reference picture, prepared, and the points that it saw."""
+    """One camera's reference image, prepared, and its points."""
 
     camera: Camera
     template: Template
@@ -55,7 +54,7 @@ class _TrackedView:
 
     @cached_property
     def reference(self) -> Array:
-        """The smoothed reference picture at the points' pixels `(N,)`."""
+        """The smoothed reference image at the points' pixels `(N,)`."""
         return sample(spline(smooth(self.template.raw, SIGMA)), *self.pixels.T)
 
     @cached_property
@@ -79,11 +78,9 @@ def solve_motion(
 ) -> Motion:
     """Rigid motion from the first tracking frame (the reference pose) to each of the others.
 
-    `points` is a cloud made without compensation. A capture without tracking frames, or a subject
-    that kept still, gives `Motion.still`, said in `stage`; where the cameras do not determine all
-    six directions, the rest of the motion stays zero, and the stage has a warning that names it. A
-    frame that looks like the reference in no pose that was found (the subject moved further than
-    the search follows, or was hidden) is lost: the motion says so, and there is a warning.
+    `points` is a cloud without motion compensation. A capture without tracking frames, or a subject
+    that kept still, gives `Motion.still`. Directions of motion that the cameras do not determine
+    stay zero, with a warning in `stage`. Frames below `ALIKE` are `Motion.lost`, with a warning.
     """
     options, stage = options or MotionOptions(), stage or Stage("motion")
     steps = [
@@ -94,7 +91,7 @@ def solve_motion(
         return Motion.none([s.index for s in steps])
     views = _views(capture, steps[0], points, stage)
     if not views:
-        stage.warn("no camera could be registered: the subject is taken to have kept still")
+        stage.warn("no camera could be registered: the subject is assumed to be still")
         return Motion.none([s.index for s in steps])
     largest, moved = 0.0, False
     for step in steps[1:]:
@@ -102,7 +99,7 @@ def solve_motion(
         quick = [v.template.register(images[v.camera.name], iterations=1) for v in present]
         largest = max([largest, *(r.largest() for r in quick)])
         moved |= _moved(quick)
-        # what moved far is registered with so large a residual that it passes for noise
+        # large motions leave registration residuals that pass for noise
         moved |= bool(present) and likeness(present, images, STILL) < ALIKE
     stage.figures["largest_2d_motion_px"] = largest
     if not moved:
@@ -134,7 +131,7 @@ def _solve_all(
         pairs += len(found)
         pose, determined, residual = from_registrations(found)
         if options.method == "direct":
-            starts = (pose, poses[-1])  # what moved far is registered no more, but followed
+            starts = (pose, poses[-1])  # registration fails on large motions
             start = max(starts, key=lambda p: likeness(present, images, p))
             pose, determined = align(present, images, start)
         if likeness(present, images, pose) < ALIKE:
@@ -146,9 +143,9 @@ def _solve_all(
         residuals.append(residual)
     if lost:
         stage.warn(
-            f"{len(lost)} of {len(steps)} tracking frames (the first is step {lost[0]}) look like "
-            "the reference in no pose that was found: the subject moved further than the search "
-            "follows, or was hidden. The stripes between them and their neighbours are left out"
+            f"{len(lost)} of {len(steps)} tracking frames (the first is step {lost[0]}) could not "
+            "be aligned: the subject moved too far or was hidden. The stripes between them and "
+            "their neighbours are ignored"
         )
         stage.figures["lost_frames"] = len(lost)
     if not found_of:
@@ -158,8 +155,8 @@ def _solve_all(
     if rank < 6:
         stage.warn(
             f"{len(views)} cameras determine {rank} of 6 directions of motion; the other "
-            f"{6 - rank} are taken as zero: {'; '.join(least.missing)}. More cameras around the "
-            "subject would determine them"
+            f"{6 - rank} are assumed zero: {'; '.join(least.missing)}. Add cameras around the "
+            "subject to determine them"
         )
     distance = [float(np.linalg.norm(t)) for _, t in poses]
     turn = [float(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())) for R, _ in poses]
@@ -190,9 +187,8 @@ def from_registrations(
 ) -> tuple[Pose, Determination, float]:
     """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
 
-    Three equations a camera: the mean shift of its points in its picture, and their turn at the
-    points' rms distance. Returns the pose, how well it is determined, and the rms residual in
-    pixels.
+    Three equations a camera: the mean shift of its points in its image, and their turn at the
+    points' rms distance. Returns the pose, its determination, and the rms residual in pixels.
     """
     target = np.concatenate(
         [[*_rigid_at(r, v.pixels.mean(axis=0)), r.angle * v.spread] for v, r in found]
@@ -203,7 +199,6 @@ def from_registrations(
         for view, _ in found:
             moved, _ = view.camera.project(view.points @ pose[0].T + pose[1])
             x, y = view.offsets.T
-            # offsets about their mean: the moved pixels' own mean drops out of both sums
             angle = np.arctan2(x @ moved[:, 1] - y @ moved[:, 0], x @ moved[:, 0] + y @ moved[:, 1])
             shift = (moved - view.pixels).mean(axis=0)
             shifts.append([*shift, angle * view.spread])
@@ -216,10 +211,8 @@ def from_registrations(
 def align(
     views: list[_TrackedView], images: dict[str, Array], start: Pose
 ) -> tuple[Pose, Determination]:
-    """The motion under which every camera's picture at the moved points equals its reference.
-
-    `images[camera] (H, W)`. Returns the pose and how well it is determined.
-    """
+    """The motion under which every camera's image `(H, W)` at the moved points equals its
+    reference, and its determination."""
     prepared = []
     for view in views:
         picture = smooth(images[view.camera.name], SIGMA)
@@ -245,9 +238,9 @@ def align(
 
 
 def likeness(views: list[_TrackedView], images: dict[str, Array], pose: Pose) -> float:
-    """How alike `images (H, W)` at the moved points and the reference are: correlation, at most 1.
+    """Correlation of `images (H, W)` at the moved points with the reference, median over cameras.
 
-    The median over the cameras; what left a picture counts as unlike.
+    Times the share of the points inside the image.
     """
     out = []
     for view in views:
@@ -274,19 +267,19 @@ def _views(
         if not capture.has(reference, camera.name):
             stage.warn(f"{camera.name} has no reference tracking frame and is not used")
             continue
-        seen = points.of_camera(camera.name).points
-        pixels, depth = camera.project(seen)
-        seen = seen[(depth > 0) & camera.inside(pixels)]
-        if len(seen) < 30:
-            stage.warn(f"{camera.name} triangulated {len(seen)} points: not used for motion")
+        own = points.of_camera(camera.name).points
+        pixels, depth = camera.project(own)
+        own = own[(depth > 0) & camera.inside(pixels)]
+        if len(own) < 30:
+            stage.warn(f"{camera.name} triangulated {len(own)} points: not used for motion")
             continue
-        if len(seen) > MOST_POINTS:
-            seen = seen[np.sort(rng.choice(len(seen), MOST_POINTS, replace=False))]
-        pixels = camera.project(seen)[0]
+        if len(own) > MOST_POINTS:
+            own = own[np.sort(rng.choice(len(own), MOST_POINTS, replace=False))]
+        pixels = camera.project(own)[0]
         image = _picture(capture, reference, camera.name)
         mask = np.zeros(image.shape, bool)
         mask[tuple(np.rint(pixels[:, ::-1]).astype(int).T)] = True
-        # the contour against the dark background is the strongest feature there is
+        # includes the contour against the dark background, the strongest feature
         mask = ndimage.binary_dilation(mask, iterations=3)
         clipped = capture.saturated(reference, camera.name)
         try:
@@ -294,12 +287,12 @@ def _views(
         except ValueError as error:
             stage.warn(f"{camera.name} is not used for motion: {error}")
             continue
-        views.append(_TrackedView(camera, template, seen, pixels))
+        views.append(_TrackedView(camera, template, own, pixels))
     return views
 
 
 def _picture(capture: Capture, step: Step, camera: str) -> Array:
-    """The square root of the light: photon noise is then the same in highlights and shade."""
+    """The square root of the radiance: photon noise is then uniform."""
     dark = dark_frame(capture, camera, step.exposure)
     image = capture.frame(step, camera).mean(axis=-1) - dark
     return np.asarray(np.sqrt(np.maximum(image, 0) / (step.level or 1.0)), np.float64)
@@ -308,17 +301,14 @@ def _picture(capture: Capture, step: Step, camera: str) -> Array:
 def _present(
     capture: Capture, step: Step, views: list[_TrackedView]
 ) -> tuple[list[_TrackedView], dict[str, Array]]:
-    """The views that have a picture of this step, and the pictures."""
+    """The views that have a frame of this step, and the images."""
     present = [v for v in views if capture.has(step, v.camera.name)]
     return present, {v.camera.name: _picture(capture, step, v.camera.name) for v in present}
 
 
 def _moved(frame: list[Registration]) -> bool:
-    """Whether the cameras' registrations of one frame together stand out of their noise.
-
-    Their squares over their variances average 1 for a still subject, with a deviation of
-    sqrt(2 / count): four of those decide.
-    """
+    """Whether the cameras' registrations of one frame are significant: χ² per degree of freedom
+    more than four deviations above 1."""
     if max((r.largest() for r in frame), default=0.0) <= STILL_PX:
         return False
     tiny = np.finfo(float).tiny
@@ -329,7 +319,7 @@ def _moved(frame: list[Registration]) -> bool:
 
 
 def _rigid_at(registration: Registration, pixel: Array) -> Array:
-    """Where a registration moves `pixel (2,)`, as a shift."""
+    """The shift `(2,)` by a registration at `pixel (2,)`."""
     c, s = np.cos(registration.angle), np.sin(registration.angle)
     offset = pixel - registration.centre
     turned = np.array([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])

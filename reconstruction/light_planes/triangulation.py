@@ -18,15 +18,15 @@ from reconstruction.light_planes.plane_conditioning import row_pitch
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.report.report import Progress, Stage, silent
 
-MIN_ANGLE_DEG = 10.0  # rays that meet their plane flatter are not used
+MIN_ANGLE_DEG = 10.0  # least angle between ray and plane
 MAX_DEVIATION = 2.5e-3  # metres: the largest standard deviation along the ray
-HULL_MARGIN = 1.0  # pixels that a point may project outside a silhouette
+HULL_MARGIN = 1.0  # pixels that a point may be outside a silhouette
 NEIGHBOURS, ISOLATION = 8, 1.6  # see `supported`
 
 RADIUS, ROUGHNESS = 2.5e-3, 3e-4
-"""Metres: a neighbourhood's size, and how far fibres lie off its plane (`flatten`)."""
+"""Metres: a neighbourhood's size, and the deviation of fibres from its plane (`flatten`)."""
 
-CHUNK = 20_000  # points whose neighbours are looked at together: about 4 kB each
+CHUNK = 20_000  # points processed together: about 4 kB each
 
 
 def sweep_peaks(capture: Capture, progress: Progress = silent) -> list[Peaks]:
@@ -38,8 +38,8 @@ def sweep_peaks(capture: Capture, progress: Progress = silent) -> list[Peaks]:
     names = [p.name for p in capture.rig.projectors if p.name in swept]
     if not names:
         raise CaptureError(
-            f"{capture.path}: no scanline frames, so nothing to triangulate; "
-            "shoot a sweep, or use a method that needs none"
+            f"{capture.path}: no scanline frames to triangulate: capture a sweep, or use the "
+            "method 'hull'"
         )
     pairs = [(c.name, p) for c in capture.rig.cameras for p in names]
     peaks = []
@@ -61,10 +61,10 @@ def triangulate(
 ) -> PointCloud:
     """Points of all cameras and projectors in the reference pose.
 
-    `motion` undoes the subject's motion step by step (None: it did not move), and stripes of steps
-    whose pose is not known are left out; `peaks` are those of `sweep_peaks` where they are already
-    known; points outside the silhouettes' `hull` go. Figures and warnings go into `stage`. Raises
-    `CaptureError` for a capture without a sweep; a sweep that lit nothing gives an empty cloud.
+    `motion` undoes the subject's motion (None: it did not move); stripes of steps of unknown pose
+    are ignored. `peaks` are those of `sweep_peaks`, if known. `hull` drops points outside the
+    silhouettes. Figures and warnings go into `stage`. Raises `CaptureError` for a capture without a
+    sweep; the cloud may be empty.
     """
     stage = stage or Stage("triangulation")
     if peaks is None:
@@ -85,10 +85,10 @@ def triangulate(
         if p.missing_rows:
             stage.warn(
                 f"{p.camera}: {len(p.missing_rows)} scanlines of {p.projector} are missing "
-                f"(first {p.missing_rows[0]}); the pixels that they lit have no point"
+                f"(first {p.missing_rows[0]}); pixels that they light have no point"
             )
         elif not len(p.row):
-            stage.warn(f"{p.camera} saw no stripe of {p.projector}")
+            stage.warn(f"{p.camera}: no stripe of {p.projector} was found")
     if hull:
         cloud = cloud.subset(inside_hull(capture, cloud.points, stage))
     counts["inside_hull"] = len(cloud)
@@ -109,18 +109,18 @@ def triangulate(
             for q in (10, 50, 90)
         }
     if len(cameras) == 1:
-        stage.warn("one camera: points only where it alone sees the stripes, none are confirmed")
+        stage.warn("one camera: points are not confirmed by a second one")
     if not len(cloud):
-        stage.warn("no lit pixel gave a point: check exposure, lamp level and the line of sight")
+        stage.warn("no point was triangulated: check exposure, projector level and line of sight")
     return cloud
 
 
 def intersect(capture: Capture, peaks: Peaks, motion: Motion | None) -> PointCloud:
-    """The points of one camera and projector: each ray cut with its plane, moved to the reference.
+    """Ray-plane intersections of one camera and projector, in the reference pose.
 
     The deviation along the ray is that of the row times the shift per row, which grows with
-    1 / sin(angle between ray and plane); across it is a pixel's footprint. Points with a flat
-    angle, too large a deviation, or behind camera or projector are left out.
+    1 / sin(angle between ray and plane); across it is a pixel's footprint. Points beyond
+    `MIN_ANGLE_DEG` or `MAX_DEVIATION`, or behind camera or projector, are dropped.
     """
     camera = capture.rig.camera(peaks.camera)
     projector = capture.rig.projector(peaks.projector)
@@ -148,7 +148,7 @@ def intersect(capture: Capture, peaks: Peaks, motion: Motion | None) -> PointClo
     n = int(usable.sum())
     index = {c.name: i for i, c in enumerate(capture.rig.cameras)}
     beams = {p.name: i for i, p in enumerate(capture.rig.projectors)}
-    # the best there is: a perfectly placed projector and the deviation of a clean stripe
+    # best attainable: perpendicular planes and the deviation of a clean stripe
     best = CLEAN * row_pitch(projector, points[usable])
     return PointCloud(
         points=points[usable],
@@ -167,10 +167,8 @@ def intersect(capture: Capture, peaks: Peaks, motion: Motion | None) -> PointClo
 
 
 def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> Bools:
-    """Which `points (N, 3)` lie in every camera's silhouette, `HULL_MARGIN` pixels of play allowed.
-
-    A camera that does not have the point in its picture, or has no silhouette, says nothing.
-    """
+    """Which `points (N, 3)` lie within `HULL_MARGIN` pixels of the silhouette of every camera that
+    has one and has the point in its image."""
     keep = np.ones(len(points), bool)
     for camera in capture.rig.cameras:
         try:
@@ -182,17 +180,16 @@ def inside_hull(capture: Capture, points: Array, stage: Stage | None = None) -> 
         if not mask.any():
             continue
         outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
-        seen, x, y, _ = camera.pixels_of(points)
-        keep &= ~(seen & (outside[y, x] > HULL_MARGIN))
+        visible, x, y, _ = camera.pixels_of(points)
+        keep &= ~(visible & (outside[y, x] > HULL_MARGIN))
     return keep
 
 
 def fuse(cloud: PointCloud) -> PointCloud:
-    """One point for those of one camera pixel that agree along the ray, weighted by information.
+    """Information-weighted means of the points of one camera pixel that agree along the ray.
 
-    Two points agree within three joint deviations, or 1 mm, and 1 mm across the ray: where the
-    subject moved, a pixel saw other places of it at other steps. Of a chain only neighbours in
-    depth are joined. The result keeps the best point's projector, row and step.
+    Neighbours in depth agree within three joint deviations, or 1 mm, and 1 mm across the ray. The
+    result has the best point's projector, row and step.
     """
     if len(cloud) < 2:
         return cloud
@@ -224,10 +221,9 @@ def fuse(cloud: PointCloud) -> PointCloud:
 def supported(points: Array, pixel: Array, neighbours: int, isolation: float) -> Bools:
     """Which `points (N, 3)` are not outliers `(N,)`.
 
-    A point stays whose distance to its neighbour number `neighbours` is at most `isolation` times
-    the median of that distance over all points, both in units of `pixel (N,)`, what a pixel of the
-    point's camera spans: a coarse camera's points lie further apart than a fine one's. With
-    `neighbours` 0 all stay. With too few points to tell, none stays.
+    The distance to neighbour number `neighbours` is at most `isolation` times the median over all
+    points, both in units of `pixel (N,)`, the footprint of the camera's pixel. With `neighbours` 0
+    all stay, with no more than `neighbours` points none.
     """
     if neighbours < 1:
         return np.ones(len(points), bool)
@@ -238,10 +234,9 @@ def supported(points: Array, pixel: Array, neighbours: int, isolation: float) ->
 
 
 def support(points: Array, radius: float, neighbours: int = 32) -> Array:
-    """How much other points back each of `points (N, 3)`: `(N,)` in (0, 1), 0.5 for the median.
+    """Support of each of `points (N, 3)` by others: `(N,)` in (0, 1), 0.5 for the median.
 
-    Neighbours count by a Gaussian of `radius` metres, at most `neighbours` of them, and each point
-    counts for itself.
+    At most `neighbours` count, by a Gaussian of `radius` metres.
     """
     if not len(points):
         return np.zeros(0)
@@ -252,13 +247,10 @@ def support(points: Array, radius: float, neighbours: int = 32) -> Array:
 
 
 def flatten(cloud: PointCloud, radius: float, roughness: float, neighbours: int = 40) -> PointCloud:
-    """Let each point use its neighbours' plane as a measurement of deviation `roughness` (metres).
+    """Kalman update of each point with its neighbours' plane, of deviation `roughness` metres.
 
     The plane is that of the neighbours within about `radius` metres, weighted by their information
-    and `PointCloud.weight`; the update is Kalman's, so that a point moves in the direction, and by
-    the share, that its own covariance leaves open. Pixels blur a surface's detail sideways and rows
-    along the ray: both are averaged out where neighbours agree. Points with under eight neighbours
-    within 2 `radius` stay as they are.
+    and `PointCloud.weight`. Points with under eight neighbours within 2 `radius` do not change.
     """
     n = len(cloud)
     k = min(neighbours, n - 1)

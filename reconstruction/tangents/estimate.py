@@ -1,4 +1,4 @@
-"""Measured tangents: what the OLAT frames say about the hair at points of its surface."""
+"""Tangents of the hair at surface points, measured in OLAT frames."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from reconstruction.tangents.line_evidence import (
     line_scores,
     line_support,
     pool,
-    seen_by,
+    visible_from,
 )
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
-    Answers,
+    OlatStack,
     observe,
     reflection_scores,
     surface_normals,
@@ -36,8 +36,8 @@ from reconstruction.tangents.reflection import (
 
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
-ROUNDS = 2  # of reading reflections: the second with a table that the first one's directions fill
-LIGHT_GROUPS = 24  # of neighbouring lights; the texture of each shows different fibres
+ROUNDS = 2  # of the reflection table, filled from the directions of the round before
+LIGHT_GROUPS = 24  # groups of neighbouring lights, each with a texture of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +54,14 @@ class Measured:
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
     def where(self, keep: Bools) -> Measured:
-        """Those that are to be kept `(N,)`."""
+        """The lines where `keep (N,)`."""
         return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
 
 
 def light_groups(lights: list[Light], count: int) -> Ints:
-    """Group number `(L,)` of each light: nearest of `count` seeds spread over the lights.
+    """Group number `(L,)` of each light: nearest of `count` seeds.
 
-    Seeds are chosen one after the other, each the light furthest from all before it, then moved
-    to the middle of their lights twice; no randomness.
+    Farthest-point seeds, then two rounds of k-means; no randomness.
     """
     p = np.stack([light.position / np.linalg.norm(light.position) for light in lights])
     count = min(count, len(p))
@@ -79,38 +78,38 @@ def light_groups(lights: list[Light], count: int) -> Ints:
     return np.asarray(group, np.int64)
 
 
-def read_answers(capture: Capture, camera: Camera, lights: Sequence[str]) -> Answers:
-    """What `camera` saw under each of `lights` alone; what is missing or saturated is not known."""
+def read_olat(capture: Capture, camera: Camera, lights: Sequence[str]) -> OlatStack:
+    """The frames of `camera` under each of `lights`; missing or saturated pixels are unknown."""
     olat = np.zeros((len(lights), camera.height, camera.width), np.float32)
     known = np.zeros(olat.shape, bool)
     for i, name in enumerate(lights):
         if capture.has_light(name, camera.name):
             image, saturated = capture.light(name, camera.name)
             olat[i], known[i] = grey(image), ~saturated
-    return Answers(camera, olat, known)
+    return OlatStack(camera, olat, known)
 
 
 @dataclass
 class Saturation:
-    """How much of what hair answered to lights is left out as saturated."""
+    """Counts hair samples (pixels under single lights) and the saturated ones."""
 
-    asked: int = 0
-    saturated: int = 0
+    observed_count: int = 0
+    saturated_count: int = 0
 
-    def add(self, answers: Answers, hair: Bools) -> None:
-        """Count one camera's on its `hair (H, W)`."""
-        known = answers.known[answers.shot][:, hair]
-        self.asked += known.size
-        self.saturated += known.size - int(known.sum())
+    def add(self, stack: OlatStack, hair: Bools) -> None:
+        """Count the samples of one camera on its `hair (H, W)`."""
+        known = stack.known[stack.shot][:, hair]
+        self.observed_count += known.size
+        self.saturated_count += known.size - int(known.sum())
 
-    def tell(self, stage: Stage) -> None:
-        """Leave the share in the report; warn where it is much."""
-        share = self.saturated / max(self.asked, 1)
+    def record(self, stage: Stage) -> None:
+        """Record the share; warn above `MOST_SATURATED`."""
+        share = self.saturated_count / max(self.observed_count, 1)
         stage.figures["saturated"] = share
         if share > MOST_SATURATED:
             stage.warn(
-                f"{share:.0%} of the hair's answers to single lights are saturated and left out: "
-                "shoot them at a shorter exposure too"
+                f"{share:.0%} of the hair pixels under single lights are saturated and ignored: "
+                "add a shorter exposure to the plan"
             )
 
 
@@ -122,10 +121,10 @@ def measure_tangents(
     stage: Stage | None = None,
     progress: Progress = silent,
 ) -> Measured:
-    """Directions at the triangulated `points (N, 3)`, or where there are none, at the depths'.
+    """Directions at the triangulated `points (N, 3)`, or without any, at the depths'.
 
-    `depths[camera] (H, W)` are those of the hair pixels, metres along z. Raises `CaptureError` for
-    a capture without OLAT frames.
+    `depths[camera] (H, W)` of the hair pixels are metres along z. Raises `CaptureError` for a
+    capture without OLAT frames.
     """
     stage = stage or Stage("orientation")
     capture = masked.capture
@@ -139,32 +138,32 @@ def measure_tangents(
     if not len(points):
         lifted = [_lifted(*view) for view in zip(cameras, shown, strict=True)]
         points = np.concatenate(lifted) if lifted else points
-    points, seen = _seen(thinned(points, options.thin), cameras, shown, options.tolerance)
+    points, visible = _visible(thinned(points, options.thin), cameras, shown, options.tolerance)
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
     reads = len(lights) >= FEWEST_LIGHTS
-    normals = _normals(points, cameras, seen) if reads else None
+    normals = _normals(points, cameras, visible) if reads else None
     candidates = half_sphere(CANDIDATES)
     scores = np.zeros((len(points), CANDIDATES), np.float32)
-    evidences, observations, left_out = [], [], Saturation()
-    for k, camera in enumerate(cameras):  # one's frames at a time: they are what takes memory
+    evidences, observations, saturation = [], [], Saturation()
+    for k, camera in enumerate(cameras):  # the frames of one camera at a time bound memory
         progress("texture", 0.6 * k / len(cameras))
         mask = masked.masks[camera.name].hair
-        answers = read_answers(capture, camera, names)
-        left_out.add(answers, mask)
-        support = line_support(responses(options.bank, _details(answers, mask, group, options)))
-        evidences.append(LineEvidence.of(camera, support, points, seen[:, k]))
+        stack = read_olat(capture, camera, names)
+        saturation.add(stack, mask)
+        support = line_support(responses(options.bank, _details(stack, mask, group, options)))
+        evidences.append(LineEvidence.of(camera, support, points, visible[:, k]))
         scores[evidences[-1].index] += line_scores(evidences[-1], candidates)
         if normals is not None:
-            observations.append(observe(answers, lights, points, normals, seen[:, k]))
-        del answers, support  # before the next one's are read
-    left_out.tell(stage)
+            observations.append(observe(stack, lights, points, normals, visible[:, k]))
+        del stack, support  # before the next camera's are read
+    saturation.record(stage)
     stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
     tangents = decide(pool(points, options.radius, options.neighbours) @ scores, candidates)
     if not reads:
         stage.leave_out(
             "directions from reflection",
-            f"{len(lights)} lights, fewer than {FEWEST_LIGHTS}: highlights fall between them",
+            f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}",
             "the second half of this stage; directions come from texture alone",
         )
     else:
@@ -179,49 +178,48 @@ def measure_tangents(
         stage.figures["turned_by_reflection_deg"] = float(np.median(np.degrees(np.arccos(turned))))
         if table.contrast < 1.3:
             stage.warn(
-                f"the hair's highlight is only {table.contrast:.2f} times its surroundings: "
-                "directions from reflection are weak"
+                f"directions from reflection are unreliable: the highlight is {table.contrast:.2f} "
+                "times its surroundings, under 1.3"
             )
     stage.figures.update(
         points=len(points),
         cameras_per_point={
-            str(k): int(n) for k, n in enumerate(np.bincount(seen.sum(axis=1))) if n
+            str(k): int(n) for k, n in enumerate(np.bincount(visible.sum(axis=1))) if n
         },
         confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)},
     )
     return Measured(points, tangents.directions, tangents.confidence)
 
 
-def _details(answers: Answers, mask: Bools, group: Ints, options: MeasureOptions) -> Floats:
-    """Textures `(G, H, W)` of the hair under each group of lights that were shot, one at least."""
+def _details(stack: OlatStack, mask: Bools, group: Ints, options: MeasureOptions) -> Floats:
+    """Textures `(G, H, W)` of the hair under each group of captured lights, at least one."""
     details = [
-        texture(answers.olat[of].sum(axis=0), mask & whole, options.texture_scale)
+        texture(stack.olat[of].sum(axis=0), mask & whole, options.texture_scale)
         for g in np.unique(group)
-        if (of := (group == g) & answers.shot).any()
-        and (whole := answers.known[of].all(axis=0)).any()
+        if (of := (group == g) & stack.shot).any() and (whole := stack.known[of].all(axis=0)).any()
     ]
     return np.stack(details or [np.zeros(mask.shape, np.float32)])
 
 
-def _seen(
+def _visible(
     points: Array, cameras: Sequence[Camera], depths: Sequence[Array], tolerance: float
 ) -> tuple[Array, Bools]:
-    """Those of `points (N, 3)` that some camera sees, and which do, `(M, C)`."""
-    seen = np.zeros((len(points), len(cameras)), bool)
+    """Those of `points (N, 3)` that are visible in some camera, and in which, `(M, C)`."""
+    visible = np.zeros((len(points), len(cameras)), bool)
     for k, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
-        seen[:, k] = seen_by(camera, depth, points, tolerance)
-    any_one = seen.any(axis=1)
-    return points[any_one], seen[any_one]
+        visible[:, k] = visible_from(camera, depth, points, tolerance)
+    any_one = visible.any(axis=1)
+    return points[any_one], visible[any_one]
 
 
-def _normals(points: Array, cameras: Sequence[Camera], seen: Bools) -> Array:
-    """Those of the points' surface `(N, 3)`, facing the cameras; `seen (N, C)` by which."""
+def _normals(points: Array, cameras: Sequence[Camera], visible: Bools) -> Array:
+    """Surface normals `(N, 3)` towards the cameras in which points are `visible (N, C)`."""
     centers = np.stack([camera.center for camera in cameras])
-    return surface_normals(points, seen @ centers - seen.sum(axis=1, keepdims=True) * points)
+    return surface_normals(points, visible @ centers - visible.sum(axis=1, keepdims=True) * points)
 
 
 def _lifted(camera: Camera, depth: Array) -> Array:
-    """The points `(P, 3)` that a `depth (H, W)` tells of, in the world's coordinates."""
+    """World points `(P, 3)` of the positive pixels of a `depth (H, W)`."""
     y, x = np.nonzero(depth > 0)
     rays = camera.rays(np.stack([x, y], axis=1))
     along = rays @ camera.R[2]

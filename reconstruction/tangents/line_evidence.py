@@ -1,4 +1,4 @@
-"""3D directions of hair at surface points, from every camera that sees them."""
+"""3D directions of hair at surface points, from the texture in all cameras."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
 
 NEARLY_PARALLEL = 0.1
-"""`spread` under which a line may turn freely within the planes: they cross at some ten degrees."""
+"""`spread` below which a line is undetermined: its planes cross at some ten degrees."""
 
 
 FINER = 8
-"""Angles at which support is looked up between two of the bank: 0.9 degrees for 24 filters."""
+"""Angles between two of the bank: 0.9 degrees for 24 filters."""
 
-_ROWS = 20_000  # of scores that are made or decided at once: they take several times their memory
+_ROWS = 20_000  # scores processed at once
 
 
 def half_sphere(count: int) -> Array:
@@ -35,11 +35,10 @@ def half_sphere(count: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LineEvidence:
-    """What one camera's texture says at the P points that it sees.
+    """Texture of one camera at its P visible points.
 
-    `index (P,)` into the points, `pixels (P, 2)` where they lie in the image, `support (P, K)` for
-    lines at k · 180°/K there. Positive support speaks for an angle, negative against it; its mean
-    over the angles is 0, so that a pixel without texture says nothing.
+    `index (P,)` into the points, `pixels (P, 2)` their projections, `support (P, K)` of image lines
+    at k · 180°/K, of mean 0 over the angles.
     """
 
     camera: Camera
@@ -48,56 +47,47 @@ class LineEvidence:
     support: Floats
 
     @classmethod
-    def of(cls, camera: Camera, support: Floats, points: AnyFloats, seen: Bools) -> LineEvidence:
-        """Of an image of `support (K, H, W)`, at those of `points (N, 3)` that are `seen (N,)`."""
-        index = np.flatnonzero(seen)
+    def of(cls, camera: Camera, support: Floats, points: AnyFloats, visible: Bools) -> LineEvidence:
+        """From `support (K, H, W)` at those of `points (N, 3)` that are `visible (N,)`."""
+        index = np.flatnonzero(visible)
         pixels, _ = camera.project(points[index])
         x, y = np.rint(pixels).astype(int).T
         return cls(camera, index, pixels, support[:, y, x].T)
 
     def part(self, which: slice) -> LineEvidence:
-        """What it says at some of its points."""
+        """The evidence at some of its points."""
         return LineEvidence(self.camera, self.index[which], self.pixels[which], self.support[which])
 
 
 def line_support(responses: AnyFloats) -> Floats:
-    """Support `(K, H, W)` from a filter bank's answers `(K, H, W)`: their excess over the mean.
-
-    Normalised by the mean over angles, so that contrast does not count twice.
-    """
+    """Support `(K, H, W)`: filter `responses (K, H, W)` relative to their mean, minus 1."""
     mean = responses.mean(axis=0)
     floor = 0.05 * float(mean.mean()) + 1e-30
     return np.asarray((responses - mean) / (mean + floor), np.float32)
 
 
-def seen_by(camera: Camera, depth: AnyFloats, points: AnyFloats, tolerance: float) -> Bools:
-    """Points `(N,)` that project to where `depth (H, W)` is known (not 0), at no more than
-    `tolerance` behind it; metres along the camera's z."""
+def visible_from(camera: Camera, depth: AnyFloats, points: AnyFloats, tolerance: float) -> Bools:
+    """Whether `points (N, 3)` are at most `tolerance` metres behind a known `depth (H, W)`."""
     on, x, y, far = camera.pixels_of(points)
     there = depth[y, x]
     return np.asarray(on & (there > 0) & (far <= there + tolerance))
 
 
 def finer(support: AnyFloats) -> Floats:
-    """Support `(N, 8 K)` at eight times as many angles as `support (N, K)`, by Fourier's series.
-
-    A bank's answer is smooth in the angle and has a period of half a turn: the peak between two
-    bins comes out where it is.
-    """
+    """Support `(N, 8 K)` at eight times as many angles as `support (N, K)`, by Fourier series."""
     count = support.shape[1]
     series = np.fft.rfft(support, axis=1)
     if count % 2 == 0:
-        series[:, -1] /= 2  # the highest frequency stands for itself and its mirror
+        series[:, -1] /= 2  # the Nyquist frequency is its own mirror
     many = np.fft.irfft(series, FINER * count, axis=1)
     return np.asarray(FINER * many, np.float32)
 
 
 def line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
-    """Support `(P, D)` that a camera's texture gives each of `candidates (D, 3)` at its P points.
+    """Support `(P, D)` of each of `candidates (D, 3)` at a camera's P points.
 
-    A candidate is looked up at the angle of its projection and weighted by the squared sine of
-    its angle to the viewing ray: a line along the ray is a dot that no texture speaks about.
-    Between the bank's angles support runs as its Fourier series does.
+    Looked up at the angle of the candidate's projection, weighted by the squared sine of its angle
+    to the viewing ray.
     """
     parts = range(0, len(evidence.index), _ROWS)
     scored = [_line_scores(evidence.part(slice(k, k + _ROWS)), candidates) for k in parts]
@@ -107,11 +97,11 @@ def line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
 def _line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
     camera = evidence.camera
     rays = camera.rays(evidence.pixels)
-    # The projection of direction t at a pixel: the image velocity of X + s t, up to its length.
-    local_ray = rays @ camera.R.T
-    slope = local_ray[:, :2] / local_ray[:, 2:]
+    # the projection of direction t at a pixel is the image velocity of X + s t, up to its length
+    local = rays @ camera.R.T
+    xy = (local[:, :2] / local[:, 2:]).astype(np.float32)
     t = (candidates @ camera.R.T).astype(np.float32)
-    flow = t[None, :, :2] - slope[:, :, None].transpose(0, 2, 1).astype(np.float32) * t[None, :, 2:]
+    flow = t[None, :, :2] - xy[:, None] * t[None, :, 2:]
     u = camera.K[0, 0] * flow[..., 0] + camera.K[0, 1] * flow[..., 1]
     v = camera.K[1, 1] * flow[..., 1]
     support = finer(evidence.support)
@@ -122,10 +112,9 @@ def _line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
 
 
 def pool(points: AnyFloats, radius: float, most: int = 24) -> sparse.csr_array:
-    """Weights `(N, N)` that average over neighbours within `radius` metres: a Gaussian of half it.
+    """Weights `(N, N)` that average over at most `most` neighbours within `radius` metres.
 
-    Each row sums to 1. At most `most` neighbours count. They are single, as scores are: double ones
-    would make a double copy of all scores, and of the means.
+    A Gaussian of half the radius; each row sums to 1. Single precision, as the scores are.
     """
     if not len(points):
         return sparse.csr_array((0, 0), dtype=np.float32)
@@ -146,8 +135,7 @@ class Tangents:
     """Undirected unit `directions (N, 3)` and `confidence (N,)` in [0, 1].
 
     Confidence is the difference of the two largest eigenvalues of the mean structure tensor over
-    the candidates, weighted by how well each explains the images: 1 when one direction stands
-    alone, 0 when two or more do as well.
+    the candidates, weighted by their scores: 1 for a single direction, 0 for two or more.
     """
 
     directions: Array
@@ -157,9 +145,8 @@ class Tangents:
 def decide(scores: AnyFloats, candidates: Array) -> Tangents:
     """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.
 
-    Scores are turned into weights by a softmax whose temperature is their median spread over the
-    rows divided by 6. The direction is the main axis of the weighted
-    structure tensor of the candidates near the best one: finer than their spacing.
+    Softmax weights, of the median standard deviation of the rows over 2 as temperature. The
+    direction is the principal axis of the weighted structure tensor of candidates near the best.
     """
     if scores.shape != (len(scores), len(candidates)):
         raise ValueError(f"scores must be (N, {len(candidates)}), got {scores.shape}")
@@ -197,12 +184,11 @@ def _full(tensors: AnyFloats) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LineConditioning:
-    """Of each point's line `(N,)`, from the planes through its images in the views that see it.
+    """Conditioning of each point's line `(N,)` by the planes through its images (Sun Eq. 4).
 
-    `views` counts the views whose texture has an orientation there. With the singular values
-    s1 >= s2 >= s3 of the planes' normals, weighted: `spread` is s2 / s1, from 0 where all planes
-    are parallel (or there is only one) to 1; `misfit` is s3 / s2, 0 where all planes meet in one
-    line, as two always do (Sun Eq. 4; Photobooth §3.2 takes the two most frontal views alone).
+    `views` counts the views with an orientation there. With the singular values s1 >= s2 >= s3 of
+    the weighted plane normals: `spread` is s2 / s1, 0 for parallel planes; `misfit` is s3 / s2, 0
+    where all planes meet in one line.
     """
 
     views: Ints
@@ -234,9 +220,8 @@ def condition_lines(
 ) -> LineConditioning:
     """Conditioning of the lines at `count` points.
 
-    A view's line is the mean of its support over doubled angles, and its weight that mean's length:
-    0 where all angles answer alike, near 1 for a single one. Views below `least_confidence` do not
-    count.
+    A view's line is the mean of its support over doubled angles, weighted by that mean's length;
+    views below `least_confidence` do not count.
     """
     moments = np.zeros((count, 3, 3))
     views = np.zeros(count, np.int64)
@@ -255,6 +240,5 @@ def condition_lines(
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(moments), 0))
     none = np.zeros(count)
     spread = np.divide(values[:, 1], values[:, 2], out=none.copy(), where=views > 1)
-    # what rounding leaves of parallel planes says nothing about where they meet
     misfit = np.divide(values[:, 0], values[:, 1], out=none, where=spread > 1e-6)
     return LineConditioning(views, spread, misfit)

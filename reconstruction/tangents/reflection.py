@@ -1,9 +1,8 @@
-"""Directions of hair from how it reflects: highlights under hundreds of single lights.
+"""Directions of hair from highlights under hundreds of single lights.
 
-A fibre mirrors light into the cone about its tangent, so a pixel's answers to all lights of an
-OLAT pass betray the tangent even where no fibre is resolved. Photobooth §4.2 refines orientations
-with a given model (Kajiya-Kay); here the model is a table that the capture itself fills, from the
-points whose texture already says their direction well.
+A fibre reflects light into the cone about its tangent, so that a pixel's OLAT responses determine
+the tangent even if no fibre is resolved. Photobooth §4.2 refines orientations with Kajiya-Kay; here
+the model is a table filled from the points of most confident texture.
 """
 
 from __future__ import annotations
@@ -19,22 +18,21 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.tangents.line_evidence import Tangents
 
-FEWEST_LIGHTS = 60  # under about one light for each 15 degrees the highlight falls between them
+FEWEST_LIGHTS = 60  # with fewer, over 15 degrees apart, the highlight falls between lights
 
 _SUMS, _AZIMUTHS, _TILTS, _FACINGS = 18, 4, 2, 8
 _LARGEST_SUM = 1.4
 _GRAZING = 0.1
 _BRIGHTEST = 6.0
 _BLOCK = 0.03
-_MOST_ALIKE = 0.99  # correlation: the table itself is off by that much
+_MOST_ALIKE = 0.99  # correlation, limited by the error of the table
 _TRUSTED = 0.4  # of the points, the most confident ones
 
 
 def surface_normals(points: Array, towards: Array, neighbours: int = 40) -> Array:
     """Unit normals `(N, 3)` of the plane through each point's neighbours, facing `towards (N, 3)`.
 
-    `towards` are directions to where the point was seen from (Hoppe et al. 1992, as in
-    Photobooth §3.2).
+    Hoppe et al. 1992, as in Photobooth §3.2.
     """
     k = min(neighbours, len(points))
     if k < 3:
@@ -47,11 +45,9 @@ def surface_normals(points: Array, towards: Array, neighbours: int = 40) -> Arra
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
-    """What a camera saw under each of L single lights: `olat (L, H, W)`, `known (L, H, W)`.
-
-    Not known is what is saturated, and, with zeros, a frame that is missing.
-    """
+class OlatStack:
+    """A camera's frames under L single lights: `olat (L, H, W)` and `known (L, H, W)`, false where
+    saturated or missing."""
 
     camera: Camera
     olat: AnyFloats
@@ -59,18 +55,18 @@ class Answers:
 
     @property
     def shot(self) -> Bools:
-        """Of which lights `(L,)` anything is known."""
+        """Lights `(L,)` with any known pixel."""
         return np.asarray(self.known.any(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """One camera's answers at the points it sees.
+    """One camera's OLAT responses at its visible points.
 
-    `index (P,)` into the points, `response (P, L)` to each light, corrected for the light's
-    distance and intensity and divided by the mean over the lights in front; `known (P, L)` where
-    that says anything; `to_light (P, L, 3)` and `to_camera (P, 3)` are unit vectors, `facing
-    (P, L)` the cosines of the lights to the surface's normal.
+    `index (P,)` into the points; `response (P, L)`, corrected for the light's distance and
+    intensity and divided by the mean over the lights in front; `known (P, L)`; unit vectors
+    `to_light (P, L, 3)` and `to_camera (P, 3)`; `facing (P, L)` the cosines of the lights to the
+    surface's normal.
     """
 
     index: Ints
@@ -82,31 +78,31 @@ class Observations:
 
 
 def observe(
-    answers: Answers,
+    stack: OlatStack,
     lights: Sequence[Light],
     points: Array,
     normals: Array,
-    seen: Bools,
+    visible: Bools,
 ) -> Observations:
-    """What a camera saw under each light at those of `points (N, 3)` that it has `seen (N,)`."""
-    camera = answers.camera
-    index = np.flatnonzero(seen)
+    """Responses of a camera under each light at those of `points (N, 3)` `visible (N,)` in it."""
+    camera = stack.camera
+    index = np.flatnonzero(visible)
     pixels, _ = camera.project(points[index])
     x, y = np.rint(pixels).astype(int).T
     away = np.stack([light.position for light in lights])[None] - points[index][:, None]
     square = (away**2).sum(axis=2)
     to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
     strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
-    shines = strength > 0  # what a dark lamp's frames hold is noise
-    known = answers.known[:, y, x].T & shines
-    response = np.maximum(answers.olat[:, y, x].T, 0) * square
+    shines = strength > 0  # frames of a dark light are noise
+    known = stack.known[:, y, x].T & shines
+    response = np.maximum(stack.olat[:, y, x].T, 0) * square
     response = np.divide(response, strength, out=np.zeros_like(response), where=shines)
     facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
     front = (facing > _GRAZING) & known
     mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
     response = response / np.maximum(mean, 1e-30)[:, None]
-    # a saturated highlight that is as bright as any is taken to be tells as much as a whole one
-    known |= (response >= _BRIGHTEST) & answers.shot
+    # responses are clipped at `_BRIGHTEST`: a brighter saturated one is as good as known
+    known |= (response >= _BRIGHTEST) & stack.shot
     to_camera = camera.center - points[index]
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     return Observations(
@@ -135,10 +131,10 @@ def _facing_cell(facing: Floats) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class Reflection:
-    """How the hair of this capture reflects: a table over geometry, mean 1 in front of the light.
+    """Reflectance table of the capture's hair over geometry, mean 1 in front of the light.
 
-    `lit (8,)` is the mean answer over the cosine of the light to the surface, what shading and
-    shadow leave; `lobe (18·4·2,)` the mean of what remains over |sin θ_i + sin θ_r| (0 on the
+    `lit (8,)` is the mean response over the cosine of the light to the surface (shading and
+    shadow); `lobe (18·4·2,)` the mean of the remaining factor over |sin θ_i + sin θ_r| (0 on the
     mirror cone), cos φ between light and camera around the fibre, and |sin θ_r|.
     """
 
@@ -149,7 +145,7 @@ class Reflection:
     def learn(
         cls, observations: Sequence[Observations], directions: Array, trusted: Bools
     ) -> Reflection:
-        """Fill the table from points that are `trusted (N,)` to lie along `directions (N, 3)`."""
+        """Fill the table from the `trusted (N,)` ones of `directions (N, 3)`."""
         total, count = np.zeros(_FACINGS), np.zeros(_FACINGS)
         for o in observations:
             cell = _facing_cell(o.facing)[o.known]
@@ -173,17 +169,17 @@ class Reflection:
 
     @property
     def contrast(self) -> float:
-        """Lobe on the mirror cone over lobe far from it: 1 says that directions cannot be read."""
+        """Lobe on the mirror cone over lobe far from it: 1 has no information on directions."""
         sums = self.lobe.reshape(_SUMS, -1)
         return float(sums[:4].mean() / max(float(sums[8:].mean()), 1e-9))
 
     def scores(self, o: Observations, points: Array, candidates: Array) -> Floats:
-        """Log-likelihoods `(P, D)`, an answer's, of `candidates (D, 3)`: 0 says nothing.
+        """Log-likelihoods `(P, D)` of `candidates (D, 3)`, per response: 0 is no information.
 
-        -½ log(1 - ρ²), of answers whose scale and noise are not known, where they have the
-        correlation ρ with the table's; 0 where that is negative. Weighted by `lit`, so that lights
-        behind the surface, in shadow, hardly count; on square roots, so that a single bright light
-        does not decide. Points of one cell of 3 cm share the directions to lights and camera.
+        -½ log(1 - ρ²), ρ the correlation of responses with the table's, clipped to positive:
+        scale and noise are unknown. Weighted by `lit`, against lights in shadow; on square roots,
+        against single bright lights. Points of one cell of 3 cm share the directions to lights and
+        camera.
         """
         out = np.zeros((len(o.index), len(candidates)), np.float32)
         model = np.sqrt(self.lobe).astype(np.float32)
@@ -217,9 +213,9 @@ class Reflection:
 def reflection_scores(
     observations: Sequence[Observations], points: Array, candidates: Array, known: Tangents
 ) -> tuple[Floats, Reflection]:
-    """Scores `(N, D)` of unit directions `candidates (D, 3)`, and the table they were read with.
+    """Scores `(N, D)` of unit directions `candidates (D, 3)`, and the table behind them.
 
-    `known` are tangents of the `points (N, 3)`: the most confident ones fill the table.
+    The most confident of the tangents `known` at `points (N, 3)` fill the table.
     """
     trusted = known.confidence >= np.quantile(known.confidence, 1 - _TRUSTED)
     table = Reflection.learn(observations, known.directions, trusted)

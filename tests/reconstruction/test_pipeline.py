@@ -30,11 +30,11 @@ from reconstruction import (
 from reconstruction.estimate import estimate
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.growing import GrowingStages
 from reconstruction.growth.field import solve_field
 from reconstruction.head.scalp import find_scalp
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import PointCloud
-from reconstruction.pipeline import _Stages
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import silent
 from reconstruction.tangents.estimate import Measured, light_groups, thinned
@@ -380,7 +380,7 @@ def test_no_strand_is_an_error_that_says_what_to_do(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = Measured(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([], nothing))
+    monkeypatch.setattr("reconstruction.stages.line_strands", lambda *_, **__: ([], nothing))
     with pytest.raises(CaptureError, match="no strand was found: the method 'hull'"):
         reconstruct(unswept, Model(tmp_path), method="photometric")
     assert not (tmp_path / "strands.npz").exists()
@@ -414,7 +414,7 @@ def test_line_stereo_alone_is_no_longer_than_the_hair_either(
 ) -> None:
     line = np.stack([np.zeros(151), np.full(151, -0.1), np.linspace(0.1, -0.2, 151)], axis=1)
     monkeypatch.setattr(
-        "reconstruction.pipeline.line_strands", lambda *_, **__: ([line], Measured.none())
+        "reconstruction.stages.line_strands", lambda *_, **__: ([line], Measured.none())
     )
     reconstruct(unswept, Model(tmp_path), method="photometric", options=QUICK)
     strands = read_strands(tmp_path / "strands.npz")
@@ -430,8 +430,8 @@ def test_what_was_seen_is_not_covered_by_roots(
     upright = np.tile([0, 0, 1.0], (90, 1))
     field, _ = solve_field(grid, grid.centers(), upright)
     seen = [p.astype(np.float32) for p in grid.centers().reshape(9, 10, 3)]
-    monkeypatch.setattr("reconstruction.pipeline.grow_from_roots", lambda *_, **__: [])
-    stages = _Stages(Model(tmp_path), QUICK, silent, Report())
+    monkeypatch.setattr("reconstruction.growing.grow_from_roots", lambda *_, **__: [])
+    stages = GrowingStages(Model(tmp_path), QUICK, silent, Report())
     stages.grown(field, find_scalp(ball(HEAD)), list(seen))
     figures = stages.report["strands"].figures
     assert figures["covered"] == 1
@@ -447,7 +447,7 @@ def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     along = np.stack([-np.sin(around), np.cos(around), 0 * around], axis=1)
     ones = np.ones(len(line), np.int64)
     segments = Segments(line, along, np.full(len(line), 0.2), 0 * ones, 3 * ones)
-    monkeypatch.setattr("reconstruction.pipeline.line_strands", lambda *_, **__: ([line], segments))
+    monkeypatch.setattr("reconstruction.stages.line_strands", lambda *_, **__: ([line], segments))
     monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
     reconstruct(unswept, Model(tmp_path), method="hull", options=replace(COARSE, max_length=0.7))
     strands = read_strands(tmp_path / "strands.npz")

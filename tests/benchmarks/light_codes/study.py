@@ -27,7 +27,6 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "neighbours": {str(n): {"neighbours": n} for n in (4, 8, 16, 23)},
     "candidates": {str(n): {"candidates": n} for n in (1, 4, 8, 24)}
     | {"all": {"candidates": 0, "lattice": 1}},
-    "coarse-to-fine": {str(n): {"coarse": n} for n in (1, 2, 4)},
     "lattice": {str(n): {"lattice": n} for n in (1, 4, 8)},
 }
 """What is varied from the defaults, one at a time."""
@@ -62,7 +61,7 @@ def study_depths(
         maps = [depths.run(k, *ranges[k]) for k in which]
         return maps, time.perf_counter() - begin
 
-    asked = sum(
+    wanted = sum(
         int((views[k].mask & (views[k].confidence >= LEAST_CONFIDENCE)).sum()) for k in which
     )
     brute, _ = found(replace(options.search, candidates=0, lattice=1))
@@ -77,7 +76,7 @@ def study_depths(
             )
             out.setdefault(name, {})[value] = {
                 "seconds": seconds,
-                "right": float(right.sum()) / asked,
+                "right": float(right.sum()) / wanted,
                 "as_brute_force": same / sum(len(m.x) for m in brute),
             }
     return out

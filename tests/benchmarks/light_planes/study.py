@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from benchmarks.light_planes.growth_study import compare_growth
 from benchmarks.light_planes.motion_errors import motion_errors, true_motion
 from benchmarks.light_planes.solver_study import compare_solvers
 from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
@@ -29,7 +28,7 @@ from reconstruction import (
 from reconstruction.arrays import AnyFloats
 from reconstruction.growth.field import field_system, solve_field
 from reconstruction.growth.hair_envelope import build_envelope
-from reconstruction.head.scalp import find_scalp, sample_roots
+from reconstruction.head.scalp import find_scalp
 from reconstruction.light_planes import (
     Motion,
     solve_motion,
@@ -73,9 +72,9 @@ def study(
     """One subject, still and drifting, and baselines; leaves models and `OUT/result.json`.
 
     `grown` adds the strands as they grew, not refined.
-    `without_help` adds what head and rig are worth that come from elsewhere, and true masks.
-    `studies` adds what one subject is enough for: the motion's worth in strands, error against run
-    time of motion, field and growth, and how stages grow.
+    `without_help` adds runs without the given head and rig, and with true masks.
+    `studies` adds, for one subject: strands with true and without motion, error against run time
+    of motion and field, and the stages' costs by size.
     """
     capture = Capture(case.still[0])
     truth = StrandTruth(capture, case.still[1])
@@ -92,7 +91,7 @@ def study(
     }
     save(out / "result.json", result)
     if grown:
-        runs.options = replace(options, refine=RefineOptions(steps=0, worth=0))
+        runs.options = replace(options, refine=RefineOptions(steps=0, marginal_coverage=0))
         runs.add("grown", capture)
         runs.options = options
         save(out / "result.json", result)
@@ -117,7 +116,7 @@ def study(
         result["motion"] = motion_study(moving, points, known, progress)
         save(out / "result.json", result)
     if studies:
-        result["series"], result["growth"] = _studies(capture, still, options, progress)
+        result["series"], result["costs"] = _studies(capture, still, options, progress)
         save(out / "result.json", result)
     return result
 
@@ -180,7 +179,7 @@ def motion_study(
 def _studies(
     capture: Capture, model: Model, options: ReconstructOptions, progress: Progress
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Error against run time of solvers and growth, and the stages' growth, in `model`'s hair."""
+    """Error against run time of solvers, and the stages' costs by size, in `model`'s hair."""
     progress("studies", 0.0)
     head = capture.head
     assert head is not None
@@ -197,22 +196,13 @@ def _studies(
     solvers = compare_solvers(*system.equations())
     field, _ = solve_field(envelope, measured.points, measured.directions, measured.confidence)
     scalp = find_scalp(head, envelope)
-    roots, normals = sample_roots(scalp, 2000, options.seed)
-    growth = compare_growth(field, roots, normals, max_length=options.max_length)
     costs = [
         *of_triangulation(capture),
         of_field(envelope, measured),
         of_strands(field, scalp, options.max_length),
     ]
-    series = {"solvers": solvers, "growth": growth}
-    plot_report(
-        Report([Stage(name, series=list(curves)) for name, curves in series.items()]),
-        model.path.parent / "plots",
-    )
-    return (
-        {name: [asdict(s) for s in curves] for name, curves in series.items()},
-        [cost.to_dict() for cost in costs],
-    )
+    plot_report(Report([Stage("solvers", series=list(solvers))]), model.path.parent / "plots")
+    return {"solvers": [asdict(s) for s in solvers]}, [cost.to_dict() for cost in costs]
 
 
 def _shares(report: Report) -> dict[str, float]:

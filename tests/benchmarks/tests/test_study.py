@@ -24,7 +24,6 @@ def test_brute_force_agrees_with_itself_and_worse_searches_find_less(
 ) -> None:
     variants = {
         "candidates": {"1": {"candidates": 1}, "8": {"candidates": 8}, "all": {"candidates": 0}},
-        "coarse-to-fine": {"2": {"coarse": 2}},
         "neighbours": {"1": {"neighbours": 1}},
     }
     monkeypatch.setattr(study, "VARIANTS", variants)
@@ -36,5 +35,4 @@ def test_brute_force_agrees_with_itself_and_worse_searches_find_less(
     assert candidates["all"]["as_brute_force"] == 1
     assert candidates["1"]["as_brute_force"] <= candidates["8"]["as_brute_force"]
     assert candidates["8"]["as_brute_force"] > 0.95
-    assert found["coarse-to-fine"]["2"]["as_brute_force"] > 0.95
     assert found["neighbours"]["1"]["right"] < candidates["8"]["right"]

@@ -91,10 +91,10 @@ def test_a_good_stage_passes_wherever_its_origin_is(height: float) -> None:
 
 def test_a_world_with_y_up_is_named() -> None:
     others = in_world(stage(), Y_UP, 1.0)
-    with pytest.raises(PlacementError, match=r"upright to the axis y .* give --up y "):
+    with pytest.raises(PlacementError, match=r" axis y .* give --up y "):
         check(others)
-    assert any(n.startswith("--up z is believed, though") for n in check(others, up="z"))
-    assert not any("believed" in n for n in check(stage(), up="z"))
+    assert any(n.startswith("--up z was applied, but") for n in check(others, up="z"))
+    assert not any("--up" in n for n in check(stage(), up="z"))
     for found, truth in zip(
         placed(others, PlacementOptions(up="y"), "opencv"), stage(), strict=True
     ):
@@ -108,13 +108,13 @@ def test_a_world_with_y_up_is_named() -> None:
 
 
 def test_a_world_upside_down_is_named() -> None:
-    with pytest.raises(PlacementError, match=r"upright to the axis -z .*give --up -z"):
+    with pytest.raises(PlacementError, match=r" axis -z .*give --up -z"):
         check(in_world(stage(), FLIP, 1.0))
 
 
 def test_wrong_camera_axes_are_named() -> None:
     others = [replace(c, R=FLIP @ c.R, t=FLIP @ c.t) for c in stage()]
-    with pytest.raises(PlacementError, match=r"read: give --camera-axes opengl"):
+    with pytest.raises(PlacementError, match=r": give --camera-axes opengl"):
         check(others)
     assert check(others, camera_axes="opengl") == check(stage())
 
@@ -129,7 +129,7 @@ def test_single_cameras_that_look_elsewhere_are_named() -> None:
     cameras = stage() + [replace(c, name=f"{c.name}_b") for c in stage(5)]
     R = cameras[3].R @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     cameras[3] = replace(cameras[3], R=R, t=-R @ cameras[3].center)
-    assert check(cameras)[0] == "cam_3: do not look at what the other cameras look at"
+    assert check(cameras)[0].startswith("cam_3: ")
     assert np.linalg.norm(Sight.of(cameras).point) < 0.05
     few = cameras[:4]
     with pytest.raises(PlacementError, match=r"1 of 4 cameras .*: cam_3;"):
@@ -155,7 +155,7 @@ def test_intrinsics_for_another_size_are_scaled() -> None:
         (small.project(points)[0] + 0.5) * 4, camera.project(points)[0] + 0.5, atol=1e-9
     )
     assert resized(camera, 300, 400) is camera
-    with pytest.raises(PlacementError, match="300x400 pixels, the picture has 400x300: turn"):
+    with pytest.raises(PlacementError, match="300x400 pixels, the image has 400x300: rotate"):
         resized(camera, 400, 300)
-    with pytest.raises(PlacementError, match="no scaled copy"):
+    with pytest.raises(PlacementError, match="cropped"):
         resized(camera, 300, 300)

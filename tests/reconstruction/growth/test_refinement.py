@@ -77,7 +77,9 @@ def test_strands_come_nearer_to_the_waves_that_lines_were_measured_on(
     noise: float, angle_deg: float
 ) -> None:
     start = strands(1, 5e-4)
-    made, figures = refine(start, lines(noise, angle_deg), RefineOptions(steps=4, worth=0))
+    made, figures = refine(
+        start, lines(noise, angle_deg), RefineOptions(steps=4, marginal_coverage=0)
+    )
     before, after = errors(start), errors(made)
     assert after[0] < 0.6 * before[0]
     assert after[1] < 0.8 * before[1]
@@ -86,7 +88,7 @@ def test_strands_come_nearer_to_the_waves_that_lines_were_measured_on(
 
 
 def test_better_lines_give_better_strands() -> None:
-    start, asked = strands(1, 5e-4), RefineOptions(steps=4, worth=0)
+    start, asked = strands(1, 5e-4), RefineOptions(steps=4, marginal_coverage=0)
     exact, fair, bad = (
         errors(refine(start, lines(noise, angle), asked)[0])
         for noise, angle in ((0.0, 0.0), (3e-4, 8.0), (8e-4, 20.0))
@@ -98,7 +100,10 @@ def test_better_lines_give_better_strands() -> None:
 def test_more_steps_do_not_follow_the_noise_of_lines_further() -> None:
     """Six strands for each measured one: most are held by no line, all are turned by some."""
     start, noisy = strands(6, 2e-4), lines(3e-4, 10.0)
-    few, many = (errors(refine(start, noisy, RefineOptions(steps=n, worth=0))[0]) for n in (3, 12))
+    few, many = (
+        errors(refine(start, noisy, RefineOptions(steps=n, marginal_coverage=0))[0])
+        for n in (3, 12)
+    )
     assert many[0] < 1.1 * few[0]
     assert many[1] < 1.15 * few[1]
 
@@ -106,7 +111,7 @@ def test_more_steps_do_not_follow_the_noise_of_lines_further() -> None:
 def test_directions_that_are_off_together_do_not_carry_strands_away() -> None:
     """As those of lines are that were read from the same pixels."""
     start, swinging = strands(6, 5e-4), lines(3e-4, 10.0, together=30e-3)
-    made, _ = refine(start, swinging, RefineOptions(worth=0))
+    made, _ = refine(start, swinging, RefineOptions(marginal_coverage=0))
     assert errors(made)[0] < 0.9 * errors(start)[0]
 
 
@@ -114,7 +119,7 @@ def test_copies_and_strands_across_the_measured_ones_go() -> None:
     many = strands(6, 1e-4)
     across = [np.linspace([-5e-3, 2e-3, z], [13e-3, 2e-3, z], 10) for z in (0.01, 0.03)]
     given = Strands.from_list([many[i] for i in range(len(many))] + across)
-    made, figures = refine(given, lines(2e-4, 5.0), RefineOptions(steps=0, worth=0.2))
+    made, figures = refine(given, lines(2e-4, 5.0), RefineOptions(steps=0, marginal_coverage=0.2))
     assert len(ASIDE) <= len(made) <= 3 * len(ASIDE)  # of six copies each
     truth = np.concatenate([wave(np.arange(0, LENGTH, 1e-3), a)[0] for a in ASIDE])
     assert cKDTree(made.points).query(truth)[0].max() < 2e-3  # none of the six is lost
@@ -124,7 +129,9 @@ def test_copies_and_strands_across_the_measured_ones_go() -> None:
 
 def test_what_lies_far_from_every_line_hardly_moves() -> None:
     start = strands(1, 5e-4)
-    made, _ = refine(start, lines(0.0, 0.0, below=40e-3), RefineOptions(steps=3, worth=0))
+    made, _ = refine(
+        start, lines(0.0, 0.0, below=40e-3), RefineOptions(steps=3, marginal_coverage=0)
+    )
     low = start.points[:, 2] < 15e-3
     moved = np.linalg.norm(made.points - start.points, axis=1)
     assert moved[low].max() < 0.2 * np.median(moved[start.points[:, 2] > 45e-3])
@@ -159,7 +166,10 @@ def test_what_is_guessed_is_not_where_cameras_would_see_it(before: float, expect
     given = Strands.from_list([seen, seen + np.array([0.04, -before, 0])])
     surface = np.full((100, 100), 0.5)
     made, figures = refine(
-        given, Measured(seen, up, np.ones(len(z))), RefineOptions(worth=0), [(camera, surface)]
+        given,
+        Measured(seen, up, np.ones(len(z))),
+        RefineOptions(marginal_coverage=0),
+        [(camera, surface)],
     )
     middle = slice(len(z) + 20, len(z) + 50)  # the root stands
     np.testing.assert_allclose(made.points[: len(z)], seen, atol=1e-6)  # what is measured stays
@@ -167,7 +177,10 @@ def test_what_is_guessed_is_not_where_cameras_would_see_it(before: float, expect
     np.testing.assert_allclose(made.points[len(z)], given.points[len(z)], atol=1e-6)
     surface[:] = 0  # a camera that sees no hair there says nothing
     still, _ = refine(
-        given, Measured(seen, up, np.ones(len(z))), RefineOptions(worth=0), [(camera, surface)]
+        given,
+        Measured(seen, up, np.ones(len(z))),
+        RefineOptions(marginal_coverage=0),
+        [(camera, surface)],
     )
     np.testing.assert_allclose(still.points, given.points, atol=1e-6)
     assert figures["guessed_in_front_before"] == (0.5 if before == 1e-3 else 0.0)
@@ -203,5 +216,5 @@ def test_confidence_is_that_of_the_line_that_agrees_best_and_0_far_from_all() ->
 
 
 def test_asking_more_of_strands_than_any_has_is_an_error() -> None:
-    with pytest.raises(ValueError, match=r"no strand adds refine\.worth 1 a millimetre"):
-        refine(strands(1, 0.0), lines(0.0, 0.0), RefineOptions(worth=1.0))
+    with pytest.raises(ValueError, match=r"no strand adds refine\.marginal_coverage 1 per"):
+        refine(strands(1, 0.0), lines(0.0, 0.0), RefineOptions(marginal_coverage=1.0))

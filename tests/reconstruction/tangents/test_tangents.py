@@ -19,10 +19,10 @@ from reconstruction.tangents.line_evidence import (
     line_scores,
     line_support,
     pool,
-    seen_by,
+    visible_from,
 )
 from reconstruction.tangents.reflection import (
-    Answers,
+    OlatStack,
     Reflection,
     observe,
     reflection_scores,
@@ -121,9 +121,9 @@ def test_points_behind_the_seen_surface_are_not_seen() -> None:
     depth = np.full((64, 64), np.linalg.norm(c.center))
     depth[:, 48:] = 0  # nothing is known there
     points = np.array([[0, 0, 0], [0, 0.003, 0], [0, 0.02, 0], [5.0, 0, 0], [0, -3.0, 0]])
-    assert seen_by(c, depth, points, 4e-3).tolist() == [True, True, False, False, False]
+    assert visible_from(c, depth, points, 4e-3).tolist() == [True, True, False, False, False]
     pixels = np.array([[47.0, 30.0], [49.0, 30.0]])
-    assert seen_by(c, depth, c.center + c.rays(pixels), 4e-3).tolist() == [True, False]
+    assert visible_from(c, depth, c.center + c.rays(pixels), 4e-3).tolist() == [True, False]
 
 
 def test_pooling_averages_over_near_points_only() -> None:
@@ -169,7 +169,7 @@ def turning_patch(full: float = np.inf, missing: int = 0):
         image[:missing] = 0
         known = ~clipped
         known[:missing] = False
-        pictures.append(Answers(c, image, known))
+        pictures.append(OlatStack(c, image, known))
     every = np.ones(len(points), bool)
     normals = surface_normals(points, np.mean([c.center for c in cameras], axis=0) - points)
     return points, truth, [observe(p, lights, points, normals, every) for p in pictures]
@@ -222,7 +222,7 @@ def test_normals_face_the_viewer() -> None:
 
 
 def test_observations_undo_distance_and_intensity() -> None:
-    """A matte point answers to near and far, weak and strong lamps alike."""
+    """A matte point stack to near and far, weak and strong lamps alike."""
     c = camera((1.0, 0.0, 0.0))
     lights = [
         Light("a", np.array([1.0, 0.2, 0]), np.full(3, 2.0)),
@@ -233,7 +233,7 @@ def test_observations_undo_distance_and_intensity() -> None:
     olat = (np.array([2.0, 5.0]) * cosines / far2)[:, None, None] * np.ones((2, 64, 64))
     seen = np.array([True])
     o = observe(
-        Answers(c, olat, np.ones(olat.shape, bool)),
+        OlatStack(c, olat, np.ones(olat.shape, bool)),
         lights,
         np.zeros((1, 3)),
         np.array([[1.0, 0, 0]]),
@@ -244,15 +244,15 @@ def test_observations_undo_distance_and_intensity() -> None:
 
 
 def test_a_lamp_that_gives_no_light_says_nothing() -> None:
-    """Of a matte point the other lamps' answers stay 1, whatever noise its frame holds."""
+    """Of a matte point the other lamps' stack stay 1, whatever noise its frame holds."""
     c = camera((1.0, 0.0, 0.0))
     lights = [
         Light(n, np.array([1.0, y, 0]), np.full(3, i)) for n, y, i in (("a", 0, 1), ("b", 1, 0))
     ]
     olat = np.array([1.0, 1e-3])[:, None, None] * np.ones((2, 64, 64))
-    answers = Answers(c, olat, np.ones(olat.shape, bool))
+    stack = OlatStack(c, olat, np.ones(olat.shape, bool))
     point, normal = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    o = observe(answers, lights, point, normal, np.array([True]))
+    o = observe(stack, lights, point, normal, np.array([True]))
     assert o.known.tolist() == [[True, False]]
     assert o.response[0, 0] == pytest.approx(1)
 

@@ -10,8 +10,8 @@ import pytest
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.linearised import SHARED, LinearisedPictures, half_of
+from appearance.render.cached_paths import CachedSampling, WeightedPixels, cache_paths
 from appearance.render.coverage import coverage
-from appearance.render.kept_paths import KeptSampling, WeightedPixels, keep_paths
 from appearance.scene.hair_scene import light_arrays
 from reconstruction import Camera, Light
 
@@ -48,7 +48,7 @@ def kept(tuft, spp, maps=None, seed=1, names=(*SHARED, "rotation")):
     mapped, own, camera, lights, pixels = tuft
     wanted = WeightedPixels(pixels, np.full((len(lights), len(pixels)), 0.3))
     scene = mapped.with_maps(own)
-    paths = keep_paths(scene, camera, lights, wanted, KeptSampling(spp, DEPTH), seed)
+    paths = cache_paths(scene, camera, lights, wanted, CachedSampling(spp, DEPTH), seed)
     intensities = light_arrays(lights)[1]
     return paths, LinearisedPictures(paths, mapped, maps or own, intensities, names)
 

@@ -37,7 +37,7 @@ _TINY = 1e-20
 
 
 @options
-class KeptSampling:
+class CachedSampling:
     """`spp` paths a pixel of at most `max_depth` vertices.
 
     A light that would bring a path less than `dim`, in units of the importance that pixels have,
@@ -74,7 +74,7 @@ class Scattering:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPaths:
+class CachedPaths:
     """The paths of one camera through P pixels under L lights, `spp` a pixel.
 
     V vertices in order of depth, those of one depth in order of their paths: `path (V,)` numbers
@@ -108,14 +108,14 @@ class KeptPaths:
         return sum(x.nbytes for x in parts if isinstance(x, np.ndarray))
 
 
-def keep_paths(
+def cache_paths(
     scene: HairScene,
     camera: Camera,
     lights: Sequence[Light],
     pixels: WeightedPixels,
-    sampling: KeptSampling,
+    sampling: CachedSampling,
     seed: int,
-) -> KeptPaths:
+) -> CachedPaths:
     """Draw paths with the hair of `scene`, which has maps on its strands (`with_maps`).
 
     Same arguments, same bytes.
@@ -143,10 +143,10 @@ class _Drawing:
     surface: Surface
     lights: Sequence[Light]
     pixels: WeightedPixels
-    sampling: KeptSampling
+    sampling: CachedSampling
     seed: int
 
-    def run(self, camera: Camera) -> KeptPaths:
+    def run(self, camera: Camera) -> CachedPaths:
         count, spp = len(self.pixels.index), self.sampling.spp
         bsdf: Any = self.surface.scene.hair_bsdf
         path = dr.arange(mi.UInt32, count * spp)
@@ -206,7 +206,7 @@ class _Drawing:
             path = dr.gather(mi.UInt32, path, going)
         joined = _joined(lit)
         path, hair, strand, along, incoming, normal = _joined(vertices)
-        return KeptPaths(
+        return CachedPaths(
             count,
             len(self.lights),
             spp,

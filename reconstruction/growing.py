@@ -1,0 +1,177 @@
+"""The stages of a reconstruction that grow strands: field, growth, refinement, roots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from reconstruction.arrays import AnyFloats, Array
+from reconstruction.capture.folder import CaptureError
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.voxels import VoxelGrid
+from reconstruction.growth.field import OrientationField, solve_field
+from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
+from reconstruction.growth.refinement import refine, supported
+from reconstruction.growth.rooting import root_all
+from reconstruction.head.scalp import Scalp, sample_roots
+from reconstruction.head.scalp_map import ScalpMap, write_root_map
+from reconstruction.light_planes import PointCloud
+from reconstruction.report.report import Stage
+from reconstruction.stages import LEAST_CONFIDENCE, Stages
+from reconstruction.tangents.estimate import Measured
+
+HEAD_OF_HAIR = 100_000 * 40e-6
+"""Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
+
+SPACING = 2e-3  # metres between a written strand's points
+
+
+class GrowingStages(Stages):
+    """The stages that grow strands along the measured lines, and write them."""
+
+    def field(
+        self, envelope: VoxelGrid, measured: Measured, scalp: Scalp | None
+    ) -> OrientationField:
+        """The orientation field in the envelope."""
+        kept = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+        with self.report.stage("field") as stage:
+            if not len(kept.points):
+                raise CaptureError(
+                    "no hair pixel has a direction: are the OLAT frames in focus and lit?"
+                )
+            field, series = solve_field(envelope, kept.points, kept.directions, kept.confidence)
+            if series is not None:
+                stage.series.append(series)
+            stage.figures.update(
+                unknowns=int((~field.measured).sum()),
+                measured_voxels=int(field.measured.sum()),
+                empty_voxels=int(field.empty.sum()),
+                degenerate_voxels=int(field.degenerate.sum()),
+            )
+            if scalp is not None:
+                stage.figures.update(scalp_cm2=scalp.area * 1e4, scalp_marked=scalp.marked)
+            if field.empty.any():
+                stage.warn(
+                    f"{int(field.empty.sum())} voxels stay empty: no measurement is connected"
+                )
+        return field
+
+    def grown(
+        self,
+        field: OrientationField,
+        scalp: Scalp,
+        measured: list[AnyFloats],
+        within: float | None = None,
+    ) -> Strands:
+        """Strands from the scalp, then through the gaps between them, all rooted.
+
+        `measured` polylines `(N, 3)` and those through gaps are rooted alike. `within` in metres:
+        see `fill_gaps`.
+        """
+        o = self.options
+        with self.report.stage("strands") as stage:
+            roots, normals = sample_roots(scalp, o.roots, o.seed)
+            self.progress("growing strands", 0.1)
+            tracing = Tracing(max_length=o.max_length)
+            rooted = grow_from_roots(field, roots, normals, tracing)
+            coverage = Coverage(field)
+            for path in rooted:
+                coverage.add(path)
+            share = coverage.share()
+            for path in measured:
+                coverage.add(path)
+            self.progress("filling gaps", 0.4)
+            gaps = fill_gaps(field, coverage, tracing, seed=o.seed, within=within)
+            filled = coverage.share()
+            self.progress("rooting strands", 0.7)
+            loose = [polyline.astype(np.float32) for polyline in measured] + gaps
+            result = root_all(rooted, loose, scalp)
+            if not result.strands:
+                raise CaptureError(
+                    "no strand could be grown: the envelope does not reach the scalp"
+                )
+            # traced both ways and connected to the scalp, they may be twice as long
+            strands = Strands.from_list([*result.strands]).cut(o.max_length).resampled(SPACING)
+            stage.figures.update(
+                strands=len(strands),
+                from_roots=len(rooted),
+                roots_without_strand=o.roots - len(rooted),
+                through_gaps=len(loose),
+                gaps_led_to_scalp=result.to_scalp,
+                gaps_joined_to_strand=result.joined,
+                gaps_dropped=result.dropped,
+                covered_by_roots=share,
+                covered=filled,
+                metres=float(strands.lengths().sum()),
+                options=asdict(o),
+            )
+            if result.dropped:
+                stage.warn(
+                    f"{result.dropped} strands could not be connected to the scalp and were removed"
+                )
+        return strands
+
+    def refined(
+        self,
+        strands: Strands,
+        measured: Measured,
+        cloud: PointCloud,
+        cameras: Sequence[Camera],
+        depths: Mapping[str, Array],
+    ) -> Strands:
+        """Strands refined jointly by the `measured` lines, if there is a sweep.
+
+        `depths (H, W)` are those of each camera's hair pixels.
+        """
+        o = self.options.refine
+        with self.report.stage("refinement") as stage:
+            lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+            why = None
+            if not len(cloud):
+                why = "without a sweep lines lie on the visual hull, millimetres off"
+            elif not len(lines.points):
+                why = "no line was measured"
+            elif not (o.steps or o.marginal_coverage):
+                why = "the options disable it"
+            if why is not None:
+                stage.leave_out("refinement", why, "this stage; strands stay as grown")
+                return strands
+            self.progress("refining strands", 0.0)
+            surfaces = [(camera, depths[camera.name]) for camera in cameras]
+            strands, figures = refine(strands, lines, o, surfaces)
+            stage.figures.update(figures)
+        return strands
+
+    def rooted(
+        self, strands: Strands, measured: Measured, scalp: Scalp, flat: ScalpMap | None
+    ) -> None:
+        """Write rooted strands, and their roots on the scalp's map; `flat` is the head's own."""
+        with self.report.stage("roots") as stage:
+            strands = replace(strands, radius=self._radius(len(strands)))
+            self._write(strands, measured, stage)
+            write_root_map(self.model, strands, scalp, flat, stage)
+
+    def unrooted(self, strands: Strands, measured: Measured, stage: Stage) -> None:
+        """Write strands without roots; raises `CaptureError` without strands."""
+        if not len(strands):
+            raise CaptureError("no strand was found: use the method 'hull', which fills the masks")
+        self._write(replace(strands, radius=self._radius(len(strands))), measured, stage)
+
+    def _write(self, strands: Strands, measured: Measured, stage: Stage) -> None:
+        """Write strands, each point with its confidence by the `measured` lines."""
+        lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
+        confidence = supported(strands, lines)
+        stage.figures.update(
+            strands=len(strands),
+            metres=float(strands.lengths().sum()),
+            radius=strands.radius,
+            measured_share=float((confidence > 0).mean()),
+        )
+        self.model.write_strands(replace(strands, confidence=confidence))
+
+    def _radius(self, count: int) -> float:
+        """Metres: the option's, or the one that keeps a head of hair's coverage."""
+        return self.options.radius or float(np.clip(HEAD_OF_HAIR / max(count, 1), 4e-5, 4e-4))
