@@ -13,6 +13,7 @@ from typing import Any
 REMOVED_IN = "0.3"
 RENAMED: dict[str, dict[str, str]] = {
     # kind of document, as a message names it: {old name: new name}
+    "refine": {"worth": "marginal_coverage"},
 }
 
 _log = logging.getLogger(__name__)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from reconstruction.deprecated import with_new_names
 from reconstruction.options import options
 
 Length = Annotated[float, Field(gt=0)]
@@ -93,6 +94,11 @@ class RefineOptions:
 
     steps: Annotated[int, Field(ge=0, le=20)] = 3
     marginal_coverage: Annotated[float, Field(ge=0, le=1)] = 0.03
+
+    @model_validator(mode="before")
+    @classmethod
+    def _new_names(cls, values: Any) -> Any:
+        return with_new_names("refine", values) if isinstance(values, dict) else values
 
 
 @options

@@ -23,6 +23,11 @@ def test_nested_json_fills_in_the_defaults() -> None:
     assert made.measure.thin == ReconstructOptions().measure.thin
 
 
+def test_the_old_name_of_a_field_is_read() -> None:
+    made = parse_options(ReconstructOptions, {"refine": {"worth": 0.1}})
+    assert made.refine.marginal_coverage == 0.1
+
+
 def test_what_is_given_by_position_is_named_by_its_field() -> None:
     assert LogGaborBank(4.0, 12) == LogGaborBank(wavelength=4.0, count=12)
     with pytest.raises(ValidationError) as caught:
