@@ -1,1 +1,1 @@
-"""Fields of reflectance on fixed strands: what the captured frames show beyond the fibre model."""
+"""Reflectance fields on fixed strands, beyond the fibre model."""

@@ -1,4 +1,4 @@
-"""Where a field has values: anchors chained along strands, over the scalp or on every strand."""
+"""Anchors of a field's values, along strands in cells of the scalp or on every strand."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from reconstruction.arrays import Array, Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """What finds a strand's anchors: its root's place on the scalp's map, and how it was edited.
+    """The strands' coordinates for the lookup of anchors.
 
-    `root_uv (S, 2)` in [0, 1]; `kept (S,)` the share of the fitted strand's length that is left;
-    `fitted (S,)` the number of the fitted strand that it stands for.
+    `root_uv (S, 2)` in [0, 1] on the scalp's map; `kept (S,)` the remaining share of the fitted
+    strand's length after cuts; `fitted (S,)` the number of the corresponding fitted strand.
     """
 
     root_uv: Array
@@ -27,7 +27,7 @@ class Places:
 
     @classmethod
     def of(cls, root_uv: Array) -> Places:
-        """Of the strands that are fitted, their roots at `root_uv (S, 2)`."""
+        """Those of the fitted strands, their roots at `root_uv (S, 2)`."""
         return cls(root_uv, np.ones(len(root_uv)), np.arange(len(root_uv)))
 
 
@@ -59,10 +59,8 @@ class Grid:
         return self.layers * self.across
 
     def near(self, strand: Ints, along: Array, places: Places) -> tuple[Ints, Ints, Floats]:
-        """The two anchors about each place on a strand, `(H,)` each, and the share of the second.
-
-        `strand (H,)` and `along (H,)`, 0 to 1 from root to tip.
-        """
+        """Two anchors `(H,)` around each point, by `strand (H,)` and `along (H,)`, 0 root to 1 tip,
+        and the weight of the second."""
         if self.columns:
             u, v = places.root_uv[strand].T
             column = np.minimum((u * self.columns).astype(np.int64), self.columns - 1)
@@ -77,10 +75,7 @@ class Grid:
 
 
 def nested(grids: Sequence[Grid], places: Places) -> Any:
-    """What takes all grids' values, one grid after the other, to the last grid's anchors.
-
-    A sparse matrix `(anchors of the last, anchors of all)`.
-    """
+    """Sparse matrix `(anchors of the last grid, anchors of all)` that sums all grids' values."""
     finest = grids[-1]
     parts = [_refined(grid, finest, places) for grid in grids[:-1]]
     return csr_matrix(hstack([*parts, identity(finest.count, np.float32)], format="csr"))
@@ -103,7 +98,7 @@ def _refined(grid: Grid, finest: Grid, places: Places) -> Any:
 
 
 def anchors_of(hits: Hits, grid: Grid, places: Places) -> tuple[Ints, Ints, Ints, Floats]:
-    """Of the hits on hair, one after the other `(H,)`: their numbers, and what `near` gives."""
+    """Numbers of the hits on hair `(H,)`, and the result of `near` for them."""
     strand = hits.column("strand").ravel()
     number = np.flatnonzero(strand >= 0)
     along = hits.column("along").ravel()[number]

@@ -1,4 +1,4 @@
-"""From a field's coefficients at anchors to harmonics at pixels, and back."""
+"""Linear map from a field's coefficients at anchors to harmonics at pixels."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from reconstruction.arrays import Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class ViewBasis:
-    """What P pixels of one camera show of a field: a linear map of its coefficients.
+    """The map of a field's coefficients to P pixels of one camera.
 
-    Coefficients `(M, v · n · c)` belong to M anchors, v harmonics of the direction to the camera
-    and n of that to the light, and c columns: three channels of each of any number of fields. The
-    result `(P, n, c)` are harmonics of the direction to the light in the world. `views (H, M v)`
-    has the weighted harmonics of each hit on hair, `turned (P n, H n)` turns harmonics of the
-    strands' frames into those of the world and adds hits up, `pixel (H,)` is each hit's; the two
-    are None where the field's frame is the world, and `views` is `(P, M v)`.
+    Coefficients `(M, v · n · c)` of M anchors, v harmonics of the direction to the camera, n of
+    that to the light, and c columns (three channels per field); the result `(P, n, c)` are
+    harmonics of the direction to the light in the world. `views (H, M v)` has the weighted
+    harmonics of each hit on hair, `turned (P n, H n)` rotates from the strands' frames to the world
+    and sums hits, `pixel (H,)` is each hit's; both are None for fields in the world's frame, where
+    `views` is `(P, M v)`.
     """
 
     views: Any
@@ -36,7 +36,7 @@ class ViewBasis:
     def of(
         cls, hits: Hits, grid: Grid, places: Places, degree: int, *, in_strands: bool
     ) -> ViewBasis:
-        """The map of the `hits` for anchors of `grid`; `in_strands`: in the strands' frames."""
+        """The map of `hits` for anchors of `grid`, if `in_strands` in the strands' frames."""
         number, low, high, share = anchors_of(hits, grid, places)
         away = hits.towards_camera().reshape(-1, 3)[number]
         of_pixel, turned = number // hits.count, None
@@ -82,23 +82,21 @@ class ViewBasis:
         return np.asarray(gathered.reshape(-1, n * n * values.shape[2]))
 
     def squares(self, values: Floats) -> Floats:
-        """About the diagonal that `values (P, n, c)`, a diagonal at the pixels, has at the anchors.
-
-        `(M, v · n · c)`; `values` must be the same within each degree.
-        """
+        """Approximate diagonal `(M, v · n · c)` at the anchors of the diagonal `values (P, n, c)`
+        at the pixels, which must be equal within each degree."""
         squared = self.views.copy()
         squared.data = squared.data**2
         flat = values.reshape(len(values), -1)
         if self.pixel is not None:
             flat = flat[self.pixel]
-            # hits of one pixel mostly share an anchor: K of weight 1/K count as one of weight 1
+            # hits of one pixel mostly share an anchor: K of weight 1/K are one of weight 1
             squared.data *= np.float32(len(flat) / max(len(values), 1))
         n = self.harmonics
         return np.asarray((squared.T @ flat).reshape(-1, n * n * values.shape[2]))
 
 
 def _turning(blocks: Sequence[Floats], pixel: Ints, pixels: int) -> Any:
-    """Hits' blocks of `turns`, transposed, beside each other as a matrix `(pixels n, H n)`."""
+    """The transposed blocks of `turns` of all hits as a sparse matrix `(pixels n, H n)`."""
     count, n = len(pixel), sum(b.shape[1] for b in blocks) + 1
     parts = [np.ones((count, 1, 1), np.float32), *blocks]
     index, values = [], []

@@ -1,4 +1,4 @@
-"""A fitted field: its values at anchors, and what it is at the pixels of any camera."""
+"""A fitted field: its values at anchors, and their evaluation at pixels."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from reconstruction.arrays import Array, Floats, Ints
 
 FIELD_FILE = "field.npz"
 HITS = HitOptions(8, seed=77)
-"""Of pictures; a field varies little within a pixel."""
+"""For images; a field varies little within a pixel."""
 _AT_ONCE = 1 << 14
-"""Pixels whose basis is in memory at once."""
+"""Pixels per block."""
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """Harmonics at the anchors of a grid; `places` find them from the strands.
+    """Harmonics at the anchors of a grid, looked up by `places`.
 
-    `values (M, v · n · 3)` are those of the anchors with numbers `rows (M,)`, 0 at all others; v
-    harmonics of the direction to the camera, n = v of that to the light, up to `degree`.
+    `values (M, v · n · 3)` of the anchors `rows (M,)`, 0 at all others; v harmonics of the
+    direction to the camera, n = v of that to the light, up to `degree`.
     """
 
     kind: Kind
@@ -50,15 +50,15 @@ class Field:
 
     @property
     def form(self) -> Form:
-        """What its values are of."""
+        """Kind and degree."""
         return Form(self.kind, self.degree)
 
     def on_cut(self, share: Array) -> Field:
-        """The field on strands of which only `share (S,)` of the length is left, from the root."""
+        """The field on strands cut to `share (S,)` of their length."""
         return replace(self, places=replace(self.places, kept=self.places.kept * share))
 
     def on_others(self, nearest: Ints) -> Field:
-        """The field on other strands: each stands for the one of that number, `nearest (S',)`."""
+        """The field on other strands, by the number of the corresponding one, `nearest (S',)`."""
         p = self.places
         others = Places(p.root_uv[nearest], p.kept[nearest], p.fitted[nearest])
         return replace(self, places=others)
@@ -102,7 +102,7 @@ class Field:
 
     @classmethod
     def load(cls, model: Model) -> Field:
-        """Read `field.npz`. Raises `ModelError` where it is not there or not a field."""
+        """Read `field.npz`. Raises `ModelError` if it is missing or not a field."""
         data = model.arrays(FIELD_FILE)
         try:
             kinds: dict[str, Kind] = {name: name for name in get_args(Kind)}
@@ -126,7 +126,7 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class FieldOnStrands:
-    """A field on strands that are `mapped`: the `SceneField` of their scene, in any pose."""
+    """A field on `mapped` strands: the `SceneField` of their scene, in any pose."""
 
     of: Field
     mapped: MappedStrands

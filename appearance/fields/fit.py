@@ -24,17 +24,17 @@ from reconstruction.arrays import Bools, Floats
 from reconstruction.report.progress import part_of
 
 MOST_CLAMPED = 0.01
-"""Share of the samples that a modulation may make darker than black before they are left out."""
+"""Share of samples with a negative modulation above which they are excluded from the fit."""
 _CLAMP_ROUNDS = 2
 JUDGED = 1000
-"""Pixels of a view, at most, that judge fits to other pictures."""
+"""Most validation pixels of a view."""
 MARGIN = 2.0
-"""Standard errors of the gain that a field must bring to be kept."""
+"""Least gain of a field in standard errors."""
 
 
 @dataclass(frozen=True)
 class Monitor:
-    """Receives the progress of a fit, and names the file in which it saves its state."""
+    """Progress callback and checkpoint file of a fit."""
 
     progress: Progress = silent
     checkpoint: Path | None = None
@@ -44,11 +44,10 @@ class Monitor:
 class FieldFit:
     """A field and its validation.
 
-    `validation` has, by group of `GROUPS`, the PSNR in dB of left-out pictures "without" the field
-    and "with" ones that were fitted to others, and the "spread" (standard error) of the gain;
-    groups that nothing could be left out for are absent. `gain` is their mean gain and its spread,
-    `tried` are the ridges that were tried, each with those of its fits. `clamped` is the share of
-    the samples that are black for being modulated below 0; `warnings` are for the user.
+    `validation` has, by group of `GROUPS`, the PSNR in dB of left-out images "without" and "with"
+    fields that were fitted to others, and the "spread" (standard error) of the gain. `gain` is the
+    mean gain and its spread; `tried` are the ridges with their gain and spread. `clamped` is the
+    share of samples with a negative modulation; `warnings` are for the user.
     """
 
     field: Field
@@ -60,28 +59,25 @@ class FieldFit:
     warnings: list[str] = dataclasses.field(default_factory=list)
 
     def doubts(self) -> list[str]:
-        """Why its images may be no better than those without it; empty if they are better.
-
-        They are where every group gains, views and lights that are both new more than their own
-        spread, and all together more than `MARGIN` spreads.
-        """
+        """Reasons to reject the field; empty if every group gains, "both new" more than its spread,
+        and the mean more than `MARGIN` spreads."""
         if not self.validation:
             return ["nothing could be left out, so it has no validation"]
         out = [
-            f"{group}: pictures are better without it, {score['without']:.2f} dB against "
-            f"{score['with']:.2f} (spread of the gain {score['spread']:.2f})"
+            f"{group}: images are better without it, {score['without']:.2f} dB against "
+            f"{score['with']:.2f} dB (standard error of the gain {score['spread']:.2f} dB)"
             for group, score in self.validation.items()
             if not score["with"] > score["without"]
         ]
         both = self.validation.get(GROUPS[-1])
         if not out and both and not both["with"] - both["without"] > both["spread"]:
             out = [
-                f"{GROUPS[-1]}: its gain may be chance, {both['with'] - both['without']:.2f} dB "
-                f"with a spread of {both['spread']:.2f}"
+                f"{GROUPS[-1]}: the gain is not significant, "
+                f"{both['with'] - both['without']:.2f} ± {both['spread']:.2f} dB"
             ]
         gain, spread = self.gain
         if not out and not gain > MARGIN * spread:
-            out = [f"its gain may be chance, {gain:.2f} dB with a spread of {spread:.2f}"]
+            out = [f"the gain is not significant, {gain:.2f} ± {spread:.2f} dB"]
         return out
 
 
@@ -94,10 +90,8 @@ def fit_pictures(
 ) -> FieldFit:
     """Fit a field to `views`, whose radiance times `scale` has white at 1.
 
-    In `options.folds` folds a part of the views and of the lights is left out; see
-    `cross_validated`. The result is fitted to everything at the ridge that is best. With a
-    checkpoint a fit that was killed goes on behind the ridges that it had done. Raises `ValueError`
-    where there is no view.
+    The ridge is chosen by `cross_validated`, the result fitted to all views and lights. With a
+    checkpoint a killed fit resumes after the ridges done. Raises `ValueError` without views.
     """
     if not views:
         raise ValueError("a field needs a view to be fitted to")
@@ -122,9 +116,7 @@ class _Fit:
         unit = _unit(views) if not options.multiplies else 1.0
         bases, grams, judges = [], [], []
         for i, view in enumerate(views):
-            monitor.progress(
-                f"{view.hits.camera.name}: reducing its pictures", 0.3 * i / len(views)
-            )
+            monitor.progress(f"{view.hits.camera.name}: reducing its images", 0.3 * i / len(views))
             bases.append(self._basis(view))
             few = view.some(JUDGED)
             judges.append((few, bases[-1] if few is view else self._basis(few)))
@@ -149,19 +141,19 @@ class _Fit:
             found = cross_validated(self.data, self.folds, self.monitor.checkpoint, validating)
             if found.best == len(ridges) - 1:
                 self.warnings.append(
-                    f"The weakest ridge, {found.ridge:g}, is best: the field may overfit."
+                    f"The weakest ridge, {found.ridge:g}, was chosen: the field may overfit."
                 )
             if found.best == 0:
                 self.warnings.append(
-                    f"The strongest ridge, {found.ridge:g}, is best: the field changes little."
+                    f"The strongest ridge, {found.ridge:g}, was chosen: the field changes little."
                 )
         else:
             found = Verdict(ridges[0], 0, [], {}, (0.0, np.inf), None)
             self.warnings.append(
-                "One view and fewer than 4 lights: nothing can be left out, so the strongest ridge "
-                "is used and the field has no validation."
+                "The field has no validation and the strongest ridge: one view and fewer than 4 "
+                "lights are too few to leave some out."
             )
-        progress("fitting to all pictures", 0.9)
+        progress("fitting to all images", 0.9)
         fine, clamped = self._final(found.ridge, found.start)
         values = np.asarray(self.data.unit * fine, np.float32)
         made = Field.of(self.form, self.grid, self.places, values)
@@ -169,7 +161,7 @@ class _Fit:
         return FieldFit(made, found.ridge, *scores, clamped, self.warnings)
 
     def _final(self, ridge: float, start: Floats | None) -> tuple[Floats, float]:
-        """The field of all pictures `(M, Q · 3)`, and the share of samples that it clamps."""
+        """The field of all images `(M, Q · 3)`, and the share of clamped samples."""
         data, options = self.data, self.options
         for round_ in range(_CLAMP_ROUNDS + 1):
             start = data.solved(data.system(ridge), start, ignore)
@@ -189,14 +181,14 @@ class _Fit:
             data = replace(data, grams=grams)
         if clamped > MOST_CLAMPED:
             self.warnings.append(
-                f"{clamped:.1%} of the samples are modulated below black and shown black: the "
-                "material is far from these frames."
+                f"{clamped:.1%} of the samples have a negative modulation and are rendered black: "
+                "the material does not match these frames."
             )
         return fine, clamped
 
 
 def _unit(views: Sequence[Pictures]) -> float:
-    """What hair sends for the irradiance it gets, in the mean: the unit of what is added."""
+    """Mean radiance over irradiance of the hair: the unit of an additive field."""
     sent = sum(float(v.captured[v.valid].sum()) for v in views)
     given = 0.0
     for view in views:

@@ -1,4 +1,4 @@
-"""What the coefficients of a field are of, and how they come to pixels."""
+"""Kind and degree of a field's coefficients."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Form:
 
     @property
     def growth(self) -> Array:
-        """What the ridge of each grows by `(Q,)`: (1 + a(a + 1))(1 + b(b + 1)) of degrees a, b."""
+        """Factor on the ridge `(Q,)`: (1 + a(a + 1))(1 + b(b + 1)) of degrees a, b."""
         grows = 1 + degrees(self.degree) * (degrees(self.degree) + 1.0)
         return np.asarray(np.outer(grows, grows).ravel())
 
     def basis(self, hits: Hits, grid: Grid, places: Places) -> ViewBasis:
-        """What the pixels of `hits` show of it, with anchors of `grid`."""
+        """Its map to the pixels of `hits`, with anchors of `grid`."""
         in_strands = self.kind == "modulation"
         return ViewBasis.of(hits, grid, places, self.degree, in_strands=in_strands)

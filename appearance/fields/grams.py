@@ -1,4 +1,4 @@
-"""Pictures reduced to what a fit of harmonics needs of them: lights vanish from its iterations."""
+"""Images reduced to normal equations in harmonics, so that iterations are independent of lights."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from reconstruction.arrays import Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Pixels under single lights: `targets` are to be `regressors` times harmonics of the light.
+    """Pixels under single lights: `regressors` times harmonics of the light fit `targets`.
 
-    `regressors` and `targets (2, L, P, 3)`, two of independent noise; `weight (L, P, 3)`; `points
-    (P, 3)` are what the lights are seen from. What is minimised are the products of the two errors:
-    squares would have the noise of the regressors in them, which pulls what is fitted to 0.
+    `regressors` and `targets (2, L, P, 3)` are two halves of independent noise, whose errors'
+    product is minimised: squares would be biased towards 0. `weight (L, P, 3)`; `points (P, 3)` are
+    the origins of the directions to lights.
     """
 
     lights: tuple[Light, ...]

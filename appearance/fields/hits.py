@@ -1,4 +1,4 @@
-"""Where the rays of a camera meet the hair first: the places that every field is about."""
+"""First hits of camera rays on hair, the points at which fields are evaluated."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _AT_ONCE = 1 << 20
 
 @options
 class HitOptions:
-    """`count` rays a pixel, jittered over it as a picture's are, from the random numbers `seed`."""
+    """`count` jittered rays a pixel, and the `seed`."""
 
     count: Annotated[int, Field(ge=1, le=64)] = 16
     seed: int = 0
@@ -53,15 +53,11 @@ class Hits:
 
     `table (P, K)` holds `RECORD`s, in memory or mapped from a file; its columns:
 
-    - `strand`: index of the strand, -1 where the ray meets no hair first
-    - `along`: the place on it as hair maps count it, 0 at the root to 1 at the tip
-    - `weight`: the ray's share of the pixel, 1/K on hair and 0 elsewhere
-    - `point`: metres, in the pose that was traced
-    - `tangent`, `normal`: unit vectors at right angles in the world: towards the tip, and the
-      strand's transported normal. With tangent × normal they are the strand's frame, which moves
-      with the hair.
-
-    (strand, along) names the same place of the hair in every pose.
+    - `strand`: index of the strand, -1 for other or no hits
+    - `along`: 0 at the root to 1 at the tip; with `strand` a point of the hair in every pose
+    - `weight`: 1/K on hair, 0 elsewhere
+    - `point`: metres, in the traced pose
+    - `tangent`, `normal`: orthogonal unit vectors, towards the tip and the transported normal
     """
 
     camera: Camera
@@ -78,15 +74,12 @@ class Hits:
         return int(self.table.shape[1])
 
     def towards_camera(self) -> Floats:
-        """Unit directions from the hits to the camera `(P, K, 3)`, of no meaning off the hair."""
+        """Unit directions from the hits to the camera `(P, K, 3)`, undefined off the hair."""
         return _unit(self.camera.center - self.column("point"))
 
     def middle(self) -> Floats:
-        """The mean point of each pixel's hits on hair `(P, 3)`, metres.
-
-        That of all pixels where there are none, a metre ahead of the camera where no pixel has any:
-        a light may be at 0.
-        """
+        """The mean point of each pixel's hits on hair `(P, 3)`, metres; of all pixels for a pixel
+        without hits, a metre ahead of the camera without any."""
         weight = self.column("weight")
         total = np.einsum("pk,pki->pi", weight, self.column("point"))
         share = weight.sum(axis=1, keepdims=True)
@@ -106,9 +99,8 @@ def find_hits(
 ) -> Hits:
     """The first hits of rays through the flat `pixels (P,)` on the strands of `mapped`.
 
-    With a `folder` they are kept there in a file of the camera's name, mapped into memory, and
-    found again by the next call for the same strands, camera, pixels and options. Raises
-    `ValueError` for pixels outside the image.
+    With a `folder` they are a memory-mapped file there, reused for the same strands, camera, pixels
+    and options. Raises `ValueError` for pixels outside the image.
     """
     options, index = options or HitOptions(), pixel_indices(camera, pixels)
     shape = (len(index), options.count)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from appearance.bsdf.maps import MappedStrands, root_normals
-from appearance.bsdf.strand_coordinates import transported
+from appearance.bsdf.maps import MappedStrands
 from appearance.fields.hits import HitOptions, Hits, find_hits
 from appearance.fields.kajiya_kay import KajiyaKay
 from appearance.fields.neighbours import camera_weights, light_weights
@@ -22,28 +20,22 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 
 HITS = HitOptions(4, seed=91)
 FLOOR = 0.3
-"""What is added to the guide on both sides of its ratio, in parts of its mean."""
+"""Added to both sides of the guide's ratio, relative to its mean."""
 _AT_ONCE = 1 << 14
 """Pixels in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A captured view and the strands that its pixels show, in the pose of the capture.
-
-    Of a pixel in which the strands as they were found have no hair, `hits` are those of the nearest
-    one that shows some.
-    `turn (P, 3)` is an axis-angle by which each pixel's strands are turned before a guide sees them
-    (`appearance.fields.search.refined`).
-    """
+    """A captured view and the `hits` of its pixels, in the pose of the capture; a pixel without
+    strands has those of the nearest pixel with some."""
 
     view: CapturedView
     hits: Hits
-    turn: Floats
 
     @classmethod
     def of(cls, view: CapturedView, mapped: MappedStrands) -> Source:
-        """With the strands' own tangents. Raises `ValueError` where no pixel shows a strand."""
+        """Raises `ValueError` if no pixel shows a strand."""
         hits = find_hits(mapped, view.camera, view.pixels, HITS)
         bare = hits.column("strand").max(axis=1) < 0
         if bare.all():
@@ -51,18 +43,17 @@ class Source:
         place = np.stack(np.divmod(view.pixels, view.camera.width), -1)
         _, nearest = cKDTree(place[~bare]).query(place[bare])
         hits.table[bare] = hits.table[np.flatnonzero(~bare)[nearest]]
-        return cls(view, hits, np.zeros((len(view.pixels), 3), np.float32))
+        return cls(view, hits)
 
     def guided(
         self, model: KajiyaKay | None, lights: Sequence[Light], pixels: Ints, epsilon: float = 0.0
     ) -> Floats:
-        """What the pixels of numbers `pixels (Q,)` send by `model` under each light `(L, Q, 3)`.
+        """Mean over a pixel's hits of irradiance times B + `epsilon`, or 1 without a `model`.
 
-        The mean over a pixel's hits on hair of irradiance times B + `epsilon`, or times 1 without
-        a model.
+        `(L, Q, 3)` for the pixels of numbers `pixels (Q,)` under each light.
         """
         point, weight = self.hits.table["point"][pixels], self.hits.table["weight"][pixels]
-        tangent = turned(self.turn[pixels][:, None], self.hits.table["tangent"][pixels])
+        tangent = self.hits.table["tangent"][pixels]
         away = _unit(self.view.camera.center - point)
         share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
         out = np.empty((len(lights), len(pixels), 3), np.float32)
@@ -77,15 +68,12 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Interpolation:
-    """What places on strands send from any light to any camera, by the captured frames about them.
+    """Radiance of points on strands for any light and camera, interpolated from captured frames.
 
-    Standard interpolation where `model` is None: the samples' weighted mean. With a model B each
-    sample I_ij is first scaled by (B + ε)/(B_ij + ε) (Photobooth, Eq. 5, with a bounded gain), ε
-    being `floor` times the mean of B. Samples are divided by the irradiance of their own lights
-    first, and multiplied by that of the new one. Lights have radial weights (`light_weights`),
-    cameras barycentric ones, of those that see the place (`camera_weights`).
-
-    `sources` and `mapped` are in the pose of the capture, that of `strands`.
+    Without a `model` the weighted mean of samples over their irradiance, times that of the new
+    light. With a model B each sample is first scaled by (B + ε)/(B_ij + ε) (Photobooth, Eq. 5), ε
+    being `floor` times the mean of B. Lights have radial weights (`light_weights`), visible cameras
+    barycentric ones (`camera_weights`). `sources` and `mapped` are in the pose of `strands`.
     """
 
     field: ReflectanceField
@@ -103,7 +91,7 @@ class Interpolation:
 
     @property
     def middle(self) -> Array:
-        """The hair's middle `(3,)`, about which directions of cameras and lights are compared."""
+        """The hair's centre `(3,)`, from which directions to cameras and lights are compared."""
         return np.asarray(self.strands.points.mean(axis=0), float)
 
     @property
@@ -112,7 +100,7 @@ class Interpolation:
         return 0.0 if self.model is None else self.floor * self.model.mean
 
     def neighbours(self, lights: Sequence[Light]) -> tuple[Ints, Floats]:
-        """The captured lights about each of `lights`, by number, and weights `(L, k)`."""
+        """Numbers and weights `(L, k)` of the captured lights near each of `lights`."""
         captured, new = (
             _unit(np.array([x.position for x in many]) - self.middle).astype(float)
             for many in (self.field.lights, lights)
@@ -135,10 +123,8 @@ class Interpolation:
         return replace(self, field=field, sources=sources)
 
     def at_hits(self, hits: Hits) -> Relit:
-        """The field at the pixels of `hits`, of any camera and any pose of the same strands.
-
-        A captured camera, where `hits` are its source's, has its own samples and no others'.
-        """
+        """The field at the pixels of `hits`, of any camera and any pose of the same strands; a
+        captured camera, by its source's `hits`, uses its own samples only."""
         for c, source in enumerate(self.sources):
             if hits is source.hits:
                 return self._own(c)
@@ -174,29 +160,18 @@ class Interpolation:
         return Relit(self, hits, index, share)
 
     def _look(self, c: int, rest: Floats, wanted: Bools, index: Ints) -> None:
-        """Put into `index (C, P, K)` the pixels of source `c` that see the wanted places."""
+        """Put into `index (C, P, K)` the pixels of source `c` that show the wanted points."""
         view = self.sources[c].view
         number = np.full(wanted.shape, -1)
         number[wanted] = view.index(rest[wanted])
         found = number >= 0
-        seen = sees(self.mapped.scene, view.camera, rest[found].astype(float))
-        number[found] = np.where(seen, number[found], -1)
+        visible = sees(self.mapped.scene, view.camera, rest[found].astype(float))
+        number[found] = np.where(visible, number[found], -1)
         index[c] = number
 
-    @cached_property
-    def frames_at_rest(self) -> tuple[Floats, Floats]:
-        """Tangents and transported normals `(N, 3)` of the strands' points."""
-        tangents = self.strands.tangents().astype(float)
-        counts, roots = np.diff(self.strands.offsets), root_normals(self.strands)
-        normals = transported(tangents, counts, roots)
-        return tangents.astype(np.float32), normals.astype(np.float32)
-
     def _at_rest(self, hits: Hits) -> Floats:
-        """The places of `hits` in the pose of the capture `(P, K, 3)`."""
-        return self.along(hits, self.strands.points)
-
-    def along(self, hits: Hits, values: Floats) -> Floats:
-        """`values (N, 3)` of the strands' points at the places of `hits` `(P, K, 3)`."""
+        """The points of `hits` in the pose of the capture `(P, K, 3)`."""
+        values = self.strands.points
         strand = np.maximum(hits.column("strand"), 0)
         offsets = self.strands.offsets
         last = offsets[strand + 1] - offsets[strand] - 1
@@ -209,10 +184,10 @@ class Interpolation:
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """An interpolation at the pixels of a camera, to be lit.
+    """An interpolation at the pixels of a camera, ready to be lit.
 
-    `index (C, P, K)` are the source's pixels of each hit, -1 where it does not see it; `share
-    (C, P, K)` their weights, which sum to 1 over the cameras, or are 0 where none sees the place.
+    `index (C, P, K)` are the sources' pixels of each hit, -1 where it is not visible; `share
+    (C, P, K)` their weights, which sum to 1 over the cameras, or are 0 if none sees the hit.
     """
 
     of: Interpolation
@@ -222,15 +197,12 @@ class Relit:
 
     @property
     def known(self) -> Floats:
-        """Of each pixel, the part of its hits that some camera saw `(P,)` in [0, 1]."""
+        """Share `(P,)` of each pixel's hits that are visible in some source."""
         return np.asarray((self.hits.column("weight") * (self.share.sum(axis=0) > 0)).sum(axis=1))
 
     def under(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
-        """Radiance `(L, P, 3)` of what is known of each pixel, and the part that is `(L, P)`.
-
-        Radiance is the mean over the hits that have samples; 0 where none has. The part is less
-        than `known` where samples are missing or saturated.
-        """
+        """Mean radiance `(L, P, 3)` over each pixel's hits that have samples, 0 without, and their
+        share `(L, P)`, less than `known` where samples are missing or saturated."""
         parts = [part._lit(lights) for part in self._parts()]
         if not parts:
             none = np.zeros((len(lights), 0, 3), np.float32)
@@ -239,20 +211,19 @@ class Relit:
         return lit, known
 
     def under_all(self, lights: Sequence[Light]) -> tuple[Floats, Floats]:
-        """`under` of all lights together: `(P, 3)`, and the least part known under any `(P,)`."""
+        """`under` all lights together: `(P, 3)`, and the least share under any `(P,)`."""
         radiance = np.zeros((len(self.hits.pixels), 3), np.float32)
         known, start = np.zeros(len(radiance), np.float32), 0
         for part in self._parts():
             end = start + len(part.hits.pixels)
             lit, share = part._lit(lights)
             radiance[start:end] = lit.sum(axis=0)
-            # a light that is not known is missing from the sum
             known[start:end] = share.min(axis=0) if len(lights) else 0
             start = end
         return radiance, known
 
     def _parts(self) -> Iterator[Relit]:
-        """The same, few pixels at a time."""
+        """The same in blocks of pixels."""
         for start in range(0, len(self.hits.pixels), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
             hits = replace(self.hits, pixels=self.hits.pixels[part], table=self.hits.table[part])
@@ -268,14 +239,15 @@ class Relit:
         return np.maximum(lit, 0), known
 
     def _add(self, c: int, lights: Sequence[Light], total: Floats, known: Floats) -> None:
-        """Add what source `c` says to `total (L, P, 3)`, and its weight to `known (L, P)`."""
+        """Add source `c` to `total (L, P, 3)`, and its weight to `known (L, P)`."""
         share = self.share[c] * self.hits.column("weight")
         pixel, k = np.nonzero(share)
         if not len(pixel) or not len(lights):
             return
         used, number = np.unique(self.index[c][pixel, k], return_inverse=True)
         point, weight = self.hits.table["point"][pixel, k], share[pixel, k]
-        tangent, away = self._tangents(c, pixel, k), _unit(self.hits.camera.center - point)
+        tangent = self.hits.table["tangent"][pixel, k]
+        away = _unit(self.hits.camera.center - point)
         order, weights = self.of.neighbours(lights)
         near, place = np.unique(order, return_inverse=True)
         incoming, place = self._incoming(c, near, used), place.reshape(order.shape)
@@ -293,7 +265,7 @@ class Relit:
     def _incoming(self, c: int, lights: Ints, pixels: Ints) -> Floats:
         """I_ij / E_ij / (B_ij + ε) of source `c` at its pixels `(Q,)`: `(k, Q, 3)`.
 
-        For the captured lights of numbers `lights (k,)`; NaN where no sample is known.
+        For the captured lights of numbers `lights (k,)`; NaN for unknown samples.
         """
         source, near = self.of.sources[c], [self.of.field.lights[j] for j in lights]
         samples = source.view.table[lights][:, pixels].astype(np.float32)
@@ -301,30 +273,9 @@ class Relit:
         unknown = np.full_like(samples, np.nan)
         return np.asarray(np.divide(samples, divisor, out=unknown, where=divisor > 0))
 
-    def _tangents(self, c: int, pixel: Ints, k: Ints) -> Floats:
-        """Tangents `(H, 3)` of hits as source `c` has them turned, in the pose of the hits."""
-        own, of = self.hits.table["tangent"][pixel, k], self.of
-        turn = of.sources[c].turn[self.index[c][pixel, k]]
-        if not turn.any():
-            return np.asarray(own)
-        # what the turn adds, in the strand's frame at rest, is added in its frame here
-        some = replace(self.hits, table=self.hits.table[pixel, k][:, None])
-        tangents, normals = of.frames_at_rest
-        rest = _unit(of.along(some, tangents)[:, 0])
-        added = turned(turn, rest) - rest
-        across = _unit(of.along(some, normals)[:, 0])
-        normal = self.hits.table["normal"][pixel, k]
-        out = own + (added * rest).sum(-1, keepdims=True) * own
-        out += (added * across).sum(-1, keepdims=True) * normal
-        out += (added * np.cross(rest, across)).sum(-1, keepdims=True) * np.cross(own, normal)
-        return _unit(out)
-
 
 def weighted(samples: AnyFloats, weights: AnyFloats) -> Floats:
-    """The mean `(Q, 3)` of `samples (k, Q, 3)` by `weights (k,)`, of those that are known.
-
-    NaN where none is, or none that has a weight.
-    """
+    """The mean `(Q, 3)` of finite `samples (k, Q, 3)` by `weights (k,)`; NaN without any."""
     good: Any = np.isfinite(samples).all(axis=-1)
     each: Any = weights[:, None] * good
     known: Any = np.where(good[..., None], samples, 0)
@@ -334,19 +285,10 @@ def weighted(samples: AnyFloats, weights: AnyFloats) -> Floats:
 
 
 def irradiance(light: Light, points: Floats) -> Floats:
-    """Across the ray from a light to `points (P, 3)`, `(P, 3)` W/m²: intensity over distance²."""
+    """Irradiance `(P, 3)`, W/m², across the ray from a light at `points (P, 3)`."""
     away = points - light.position
     squared = np.maximum((away * away).sum(axis=-1, keepdims=True), 1e-12)
     return np.asarray(light.intensity_towards(points) / squared, np.float32)
-
-
-def turned(axis_angle: Floats, vectors: Floats) -> Floats:
-    """`vectors (..., 3)` turned about `axis_angle (..., 3)` by its length in radians."""
-    angle = np.linalg.norm(axis_angle, axis=-1, keepdims=True)
-    axis = axis_angle / np.maximum(angle, 1e-12)
-    along = (axis * vectors).sum(axis=-1, keepdims=True) * axis
-    out = along + np.cos(angle) * (vectors - along) + np.sin(angle) * np.cross(axis, vectors)
-    return np.asarray(out, np.float32)
 
 
 def _unit(vectors: Array | Floats) -> Floats:

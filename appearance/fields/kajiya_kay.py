@@ -1,4 +1,4 @@
-"""The reflectance that guides an interpolation of frames: Kajiya and Kay's."""
+"""Kajiya and Kay's reflectance, the guide of an interpolation of frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reconstruction.arrays import Floats
 class KajiyaKay:
     """K(t, h) cos θ with K = |sin(t, h)|^α + ρ_d (Photobooth, Eq. 4; ρ_s = 1, L = 1).
 
-    `diffuse` is ρ_d and `exponent` α. Raises `ValueError` where one is negative or not finite.
+    `diffuse` is ρ_d, `exponent` α. Raises `ValueError` for negative or infinite ones.
     """
 
     diffuse: float
@@ -33,7 +33,7 @@ class KajiyaKay:
         """
         along_light = _dot(tangent, towards_light)
         h = towards_camera + towards_light
-        squared = np.maximum(_dot(h, h), np.float32(1e-12))  # 0 where light and camera are opposite
+        squared = np.maximum(_dot(h, h), np.float32(1e-12))  # 0 for opposite light and camera
         sine_squared = np.clip(1 - _dot(tangent, h) ** 2 / squared, 0, 1)
         specular = sine_squared ** np.float32(0.5 * self.exponent)
         cosine = np.sqrt(np.clip(1 - along_light**2, 0, 1))

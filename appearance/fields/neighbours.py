@@ -1,4 +1,4 @@
-"""Which captured cameras and lights stand for a new one, and with what weights."""
+"""Interpolation weights of captured cameras and lights for a new one."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from scipy.spatial import ConvexHull
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 RADIAL = 6
-"""Neighbours of a light with radial weights; Photobooth takes about as many."""
+"""Neighbours of a light with radial weights, about as many as Photobooth's."""
 
 
 def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
-    """Weights `(C,)` of cameras in unit `directions (C, 3)` for one in that `towards (3,)`.
+    """Weights `(C,)`, of sum 1, of cameras in unit `directions (C, 3)` for the direction `towards`.
 
-    Barycentric over the triangles of the sphere (the faces of the directions' convex hull), so that
-    at most three are not 0 and they vary continuously (Photobooth §4.1). A direction that no
-    triangle holds has the two cameras of the edge nearest to it, or the one. Sums to 1.
+    Barycentric over the faces of the directions' convex hull (Photobooth §4.1); a direction outside
+    of all triangles uses the nearest edge.
     """
     directions = np.asarray(directions, float)
     corners = _triangles(directions)
@@ -28,7 +27,7 @@ def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
         if abs(np.linalg.det(matrix)) < 1e-9:
             continue
         inside = np.linalg.solve(matrix, towards)
-        # of a face in front and one behind, the outer one: its plane is the further out
+        # the outer of a front and a back face
         if inside.min() >= -1e-9 and 1 / inside.sum() > best:
             best, weights = 1 / inside.sum(), inside
             chosen = corner
@@ -42,12 +41,10 @@ def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
 
 
 def light_weights(directions: AnyFloats, towards: AnyFloats) -> tuple[Ints, Floats]:
-    """Of each direction `towards (T, 3)` the nearest lights `(T, k)` and their weights `(T, k)`.
+    """The nearest lights `(T, k)` to each direction `towards (T, 3)`, and weights `(T, k)`, sum 1.
 
-    Unit `directions (L, 3)`. The weights are radial ones of `RADIAL` lights (Photobooth §4.1):
-    Franke and Little's ((R - d)/(R d))² of the angle d, R that of the next light. They vary
-    continuously, and give a light's own direction to it alone, in equal parts to lights in one
-    place. Rows sum to 1.
+    Unit `directions (L, 3)`. Radial weights of `RADIAL` lights (Photobooth §4.1): Franke and
+    Little's ((R - d)/(R d))² of the angle d, R that of the next light.
     """
     cosine = np.clip(towards @ directions.T, -1, 1)
     count = min(RADIAL, len(directions))
@@ -55,13 +52,13 @@ def light_weights(directions: AnyFloats, towards: AnyFloats) -> tuple[Ints, Floa
     angle = np.arccos(np.take_along_axis(cosine, order[:, : count + 1], axis=1))
     near, order = angle[:, :count], order[:, :count]
     reach = angle[:, -1:] if len(directions) > count else np.full((len(towards), 1), 2 * np.pi)
-    left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # where all are as far: alike
+    left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # equal if all are equally far
     weight = (left / np.maximum(near, 1e-5)) ** 2
     return order, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def _triangles(directions: AnyFloats) -> Ints:
-    """Triangles `(F, 3)` of the directions' hull; of two cameras or one, degenerate ones."""
+    """Triangles `(F, 3)` of the directions' hull; degenerate for one or two cameras."""
     if len(directions) <= 3:
         return np.arange(3)[None] % len(directions)
     return np.asarray(ConvexHull(directions, qhull_options="QJ").simplices)
@@ -70,7 +67,7 @@ def _triangles(directions: AnyFloats) -> Ints:
 def _nearest_edge(
     directions: AnyFloats, towards: AnyFloats, edges: list[tuple[int, int]]
 ) -> tuple[list[int], Array]:
-    """The ends of the arc nearest to `towards`, and its place between them."""
+    """The ends of the arc nearest to `towards`, and their weights."""
     found = []
     for i, j in edges:
         ends = directions[[i, j]].T

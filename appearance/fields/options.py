@@ -1,4 +1,4 @@
-"""How a field is fitted; light, so that a service checks options without Mitsuba."""
+"""Options of a field's fit, without Mitsuba, for a service to check them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 from reconstruction.options import Count, options
 
 Kind = Literal["modulation", "additive", "whole"]
-"""What a field is of: a factor on inverse rendering's light, light added to it, or all light."""
+"""A factor on inverse rendering's light, light added to it, or all light."""
 Degree = Annotated[int, Field(ge=0, le=3)]
 Positive = Annotated[float, Field(gt=0)]
 
@@ -34,14 +34,13 @@ class FieldOptions:
     """How a field of reflectance is fitted.
 
     `kind`: "modulation" multiplies the light of inverse rendering by 1 + m, m in the strands'
-    frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" is all of the
-    light, without inverse rendering (GaussianHair's appearance, as GroomLight's supplement has it).
-    `degree` of the harmonics of the direction to the camera and to the light. `levels`: grids of
-    anchors (n_c along strands, w, h cells of the scalp's map) whose values add up, from coarse to
-    fine; w = h = 0 are anchors on every strand. `ridges` are tried from the last to the first,
-    and grow with the degrees a and b of a coefficient as (1 + a(a + 1))(1 + b(b + 1)). `iterations`
-    of conjugate gradients at most, fewer once the gradient has fallen to `tolerance`. Views and
-    lights are parted into `folds` each, and left out part by part to choose the ridge and judge.
+    frames; "additive" (GroomLight §3.3) adds to it, in the world's frame; "whole" replaces it
+    (GaussianHair's appearance, as in GroomLight's supplement). `degree` of the harmonics of the
+    directions to camera and light. `levels`: grids of anchors (n_c along strands, w, h cells of the
+    scalp's map) that add up, from coarse to fine; w = h = 0 are anchors on every strand. `ridges`
+    are tried from the last to the first, times (1 + a(a + 1))(1 + b(b + 1)) for the degrees a and b
+    of a coefficient. At most `iterations` of conjugate gradients, until the relative gradient is
+    `tolerance`. Views and lights are split into `folds` each for cross-validation.
     """
 
     kind: Kind = "modulation"
@@ -54,7 +53,7 @@ class FieldOptions:
 
     @property
     def multiplies(self) -> bool:
-        """Whether the field is a factor on inverse rendering's light."""
+        """Whether the field is a modulation."""
         return self.kind == "modulation"
 
 
@@ -62,9 +61,9 @@ class FieldOptions:
 class FieldRequest:
     """The options of a job.
 
-    At most `lights` of the training lights and `pixels` of each camera's hair are used. `hits` rays
-    a pixel find the strands that it shows; pictures of inverse rendering have `spp` paths a pixel
-    of at most `max_depth` vertices. "none" fits no field and removes an earlier one.
+    At most `lights` training lights and `pixels` of each camera's hair are used, `hits` rays a
+    pixel to find strands, and `spp` paths a pixel of at most `max_depth` vertices to render. "none"
+    fits no field and removes an earlier one.
     """
 
     field: Literal["none", "modulation", "additive"] = "modulation"

@@ -19,11 +19,9 @@ from reconstruction.arrays import AnyFloats, Bools, Floats
 class Pictures:
     """One view of a fit.
 
-    `halves (2, L, P, 3)`, two independent pictures of inverse rendering's (twice the same where it
-    has no noise), and `captured (L, P, 3)` are radiance at the pixels of `hits` under each of
-    `lights` alone; `valid (L, P)` is false where a frame is missing or saturated. Products of the
-    halves have no noise in the mean: squares would make a fit, and its judge, prefer darkness,
-    whose noise is less.
+    `halves (2, L, P, 3)`, two independent renderings, and `captured (L, P, 3)` are radiance at the
+    pixels of `hits` under each of `lights` alone; `valid (L, P)` is false where a frame is missing
+    or saturated. Products of the halves' errors are unbiased by noise.
     """
 
     hits: Hits
@@ -40,7 +38,7 @@ class Pictures:
         return Pictures(self.hits, few, self.halves[:, index], captured, valid)
 
     def some(self, most: int) -> Pictures:
-        """At most `most` of its pixels, evenly chosen."""
+        """At most `most` of its pixels, evenly spaced."""
         count = len(self.hits.pixels)
         if count <= most:
             return self
@@ -50,10 +48,8 @@ class Pictures:
         return Pictures(hits, self.lights, self.halves[:, :, few], captured, valid)
 
     def samples(self, options: FieldOptions, scale: float, unit: float = 1.0) -> Samples:
-        """What the fit of a kind of field is about, in exposure units: 1 is white.
-
-        What is added is counted in `unit`s of radiance per irradiance.
-        """
+        """The samples of the fit in exposure units (1 is white), an additive field in `unit`s of
+        radiance per irradiance."""
         halves, captured = (x.astype(np.float64) * scale for x in (self.halves, self.captured))
         level = losses.level(captured)
         if options.kind != "whole":
@@ -72,6 +68,6 @@ class Pictures:
 
 
 def irradiance(light: Light, points: Floats) -> Floats:
-    """W/m² `(P, 3)` across the light's direction at `points (P, 3)`."""
+    """Irradiance `(P, 3)`, W/m², across the light's direction at `points (P, 3)`."""
     squared = np.sum((light.position - points) ** 2, axis=-1, keepdims=True)
     return np.asarray(light.intensity_towards(points) / squared, np.float32)

@@ -1,4 +1,4 @@
-"""A field fitted to a capture: its frames beside what inverse rendering makes of them."""
+"""The fit of a field to a capture, on top of inverse rendering."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ from reconstruction.report.report import free_memory
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """The material alone of a capture's model: a scene with its maps and no field.
+    """The material of a capture's model: its `scene` with maps and without field.
 
-    `lights` are those of the fit, as they were found; `mapped` the scene's strands; `scale` the
-    capture's exposure.
+    `lights` have fitted intensities; `mapped` are the scene's strands; `scale` is the exposure.
     """
 
     mapped: MappedStrands
@@ -54,9 +53,9 @@ def fit_field(
 ) -> FieldFit:
     """Fit a field to the frames of `training` under the lights of `rendered`.
 
-    Hits and rendered pictures are kept in the model's folder "work" while the fit runs: killed, it
-    goes on behind the last view that was rendered. Raises `ModelError` where no camera sees hair or
-    memory is short.
+    Hits and renderings are stored in the model's folder "work" while the fit runs: a killed one
+    resumes after the last rendered view. Raises `ModelError` if no camera sees hair or memory is
+    insufficient.
     """
     if request.field == "none":
         raise ValueError("the field 'none' cannot be fitted")
@@ -72,13 +71,13 @@ def fit_field(
     needed = memory_needed(
         [len(p) for p in pixels.values()], len(rendered.lights), strands, request
     )
-    progress(f"will take about {needed:.1f} GB of memory beside the scene", 0.0)
+    progress(f"needs about {needed:.1f} GB of memory beside the scene", 0.0)
     free = free_memory()
     if free is not None and needed > free:
         raise ModelError(
-            f"{model}: a field of {len(rendered.lights)} lights takes about {needed:.1f} GB of "
-            f"memory, and {free:.1f} GB are free: lower the field's pixels, now {request.pixels}, "
-            f"hits, now {request.hits}, or lights, now {request.lights}"
+            f"{model}: a field of {len(rendered.lights)} lights needs about {needed:.1f} GB of "
+            f"memory, {free:.1f} GB are free: lower the field's pixels ({request.pixels}), hits "
+            f"({request.hits}) or lights ({request.lights})"
         )
     views = []
     for i, (name, index) in enumerate(pixels.items()):
@@ -99,7 +98,7 @@ def _pictures(
     folder: Path,
     seed: int,
 ) -> Pictures:
-    """One camera's pictures; the rendered ones from `folder`, where they are made once."""
+    """One camera's images; the renderings are stored in `folder`."""
     name, index = view
     camera = training.rig.camera(name)
     hits = find_hits(rendered.mapped, camera, index, HitOptions(request.hits, seed), folder)
@@ -120,13 +119,13 @@ def _pictures(
                 made[k] = olat_smoothed(rendered.scene, camera, rendered.lights, half, pixels=index)
             made.flush()
     names = [light.name for light in rendered.lights]
-    seen = observe(training, name, names, index)
+    captured = observe(training, name, names, index)
     halves: Floats = np.load(file, mmap_mode="r")
-    return Pictures(hits, rendered.lights, halves, seen.radiance, seen.valid)
+    return Pictures(hits, rendered.lights, halves, captured.radiance, captured.valid)
 
 
 def _materials(scene: HairScene) -> Sequence[Any]:
-    """The arrays that a scene's pictures depend on."""
+    """The arrays that a scene's renderings depend on."""
     parts: list[Any] = [np.array(scene.skin)]
     shapes = (scene.hair_shape, scene.head_shape, scene.hair_bsdf)
     for part in (x for x in shapes if x is not None):
@@ -136,7 +135,7 @@ def _materials(scene: HairScene) -> Sequence[Any]:
 
 
 def memory_needed(pixels: Sequence[int], lights: int, strands: int, request: FieldRequest) -> float:
-    """GB that a fit takes beside the scene, about: `pixels` of each view under `lights`."""
+    """Approximate GB of a fit beside the scene, by `pixels` of each view under `lights`."""
     folds, n = request.fit.folds, count_of(request.fit.degree)
     turning = sum((2 * k + 1) ** 2 for k in range(request.fit.degree + 1))
     hit = RECORD.itemsize + 2 * n * 8 + 8 * turning + 4 * n + 8

@@ -1,4 +1,4 @@
-"""Captured frames under single lights, kept for the places on strands: a reflectance field."""
+"""Hair pixels of captured frames under single lights: a reflectance field."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from reconstruction.files.durable import require_free, writing
 
 Halves = NDArray[np.float16]
 _LARGEST = 6e4
-"""What a sample is clipped to; the largest half is 65,504."""
+"""Largest sample; the largest half is 65,504."""
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedView:
     """A captured camera's hair pixels, `pixels (P,)` flat indices, under L lights.
 
-    `table (L, P, 3)` is the radiance at full level times an exposure, NaN where the frame is
-    missing, saturated or not a number; in memory, or mapped from a file.
+    `table (L, P, 3)`, in memory or mapped from a file, is the radiance at full level times an
+    exposure, NaN where missing or saturated.
     """
 
     camera: Camera
@@ -36,10 +36,8 @@ class CapturedView:
         return self.table[lights].astype(np.float32)
 
     def index(self, points: AnyFloats) -> Ints:
-        """Which of the pixels each of the world `points (..., 3)` falls on; -1 where on none.
-
-        Occlusion by something else is not tested.
-        """
+        """Numbers `(...)` of the pixels that world `points (..., 3)` project to, -1 for others;
+        without a test of occlusion."""
         number = np.full(self.camera.width * self.camera.height, -1)
         number[self.pixels] = np.arange(len(self.pixels))
         inside, x, y, _ = self.camera.pixels_of(points.reshape(-1, 3))
@@ -49,12 +47,8 @@ class CapturedView:
 
 @dataclass(frozen=True, eq=False)
 class ReflectanceField:
-    """All `views` of a capture under single `lights` (Photobooth §4).
-
-    Samples are radiance times `scale`. A place on a strand finds its samples by projection into the
-    pictures, as in the paper: a pixel is finer than anchors on strands can be, and an anchor would
-    keep a mean of the pixels around it.
-    """
+    """All `views` of a capture under single `lights` (Photobooth §4); samples are radiance times
+    `scale`, found by projection of points on strands."""
 
     lights: tuple[Light, ...]
     views: tuple[CapturedView, ...]
@@ -62,7 +56,7 @@ class ReflectanceField:
 
     @property
     def bytes(self) -> int:
-        """What the tables take, on the disk or in memory."""
+        """Size of the tables."""
         return sum(view.table.nbytes for view in self.views)
 
 
@@ -76,11 +70,10 @@ def gather(
 ) -> ReflectanceField:
     """Read the frames of `capture`'s single lights at the flat `pixels (P,)` of each named camera.
 
-    `scale` multiplies radiance, so that halves hold it well: about what takes white to 1. With a
-    `folder` each camera's table is a file there, mapped into memory, and found again as long as
-    frames, lights, pixels and scale are the same. Without, all are in memory. `progress` is called
-    at every frame, and may raise to stop; a camera's file is then there whole or not at all. Raises
-    `DiskFull` before a table is begun for which there is no room.
+    `scale` multiplies radiance so that halves hold it: white becomes about 1. With a `folder` each
+    camera's table is a memory-mapped file, reused for the same frames, lights, pixels and scale.
+    `progress` is called at every frame, and may raise to stop. Raises `DiskFull` before a table
+    without room.
     """
     names = capture.olat_lights()
     cameras = [c for c in capture.rig.cameras if len(pixels.get(c.name, ()))]
@@ -97,7 +90,7 @@ def gather(
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """What is read of one camera."""
+    """The frames of one camera."""
 
     capture: Capture
     camera: Camera

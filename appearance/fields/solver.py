@@ -24,10 +24,8 @@ def ignore(_done: int, _coefficients: Floats, _gradient: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ViewSystem:
-    """A view in one or more fits: the basis of its pixels, and its images reduced to quadratics.
-
-    Its pictures may be in parts, `grams`, of which each belongs to the fits with numbers in `fits`.
-    """
+    """A view in one or more fits: the basis of its pixels, and its images reduced to quadratics in
+    parts, `grams`, each of the fits with numbers in `fits`."""
 
     basis: ViewBasis
     grams: Sequence[Gram]
@@ -35,14 +33,12 @@ class ViewSystem:
 
     @property
     def used(self) -> tuple[int, ...]:
-        """The fits that any of its pictures belongs to."""
+        """The fits of any of its parts."""
         return tuple(sorted(set().union(*self.fits)))
 
     def summed(self, of: Callable[[Gram, list[int]], Floats]) -> Floats:
-        """The sum `(P, n, 3 · used)` of what the parts `(P, n, 3, …)` add to the fits they are in.
-
-        `of` gets a part and where its fits are among those used.
-        """
+        """The sum `(P, n, 3 · used)` over parts of `of` a part and the indices of its fits among
+        those used, `(P, n, 3, …)`."""
         used, n = self.used, self.basis.harmonics
         total = np.zeros((len(self.grams[0].right), n, 3, len(used)), np.float32)
         for gram, fits in zip(self.grams, self.fits, strict=True):
@@ -55,12 +51,11 @@ class ViewSystem:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """The errors of F fields on some views, and a ridge: each a quadratic of its coefficients.
+    """The squared errors of F fields on some views, with a ridge.
 
-    Coefficients `(N, Q · 3 · F)` are those of all grids, the fits' side by side: sparse
-    matrices are gone through once for all of them. `nested (M, N)` adds grids up at the anchors of
-    the last. `ridge` is that of the degree 0; what it does not change is `known` to the systems
-    that `dataclasses.replace` makes of this one.
+    Coefficients `(N, Q · 3 · F)` of all grids, the fits' side by side, so that sparse products are
+    shared. `nested (M, N)` sums grids at the anchors of the last. `ridge` is that of degree 0;
+    `known` caches terms independent of it across `dataclasses.replace`.
     """
 
     views: Sequence[ViewSystem]
@@ -72,7 +67,7 @@ class LeastSquares:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the coefficients."""
+        """Shape of the coefficients."""
         return self.nested.shape[1], self.form.count * 3 * self.fits
 
     @property
@@ -96,7 +91,7 @@ class LeastSquares:
         return np.asarray(gathered + self.penalty * coefficients)
 
     def diagonal(self) -> Floats:
-        """About the diagonal `(N, Q · 3 · F)` of the left side."""
+        """Approximate diagonal `(N, Q · 3 · F)` of the left side."""
         if "diagonal" not in self.known:
             k = degrees(self.form.degree)
             pixels = [s.summed(lambda gram, _: gram.diagonal(k)[..., None]) for s in self.views]
@@ -106,11 +101,11 @@ class LeastSquares:
         return np.asarray(self.known["diagonal"] + self.penalty)
 
     def each(self, values: AnyFloats) -> Array:
-        """The sums `(F,)` of `values (N, Q · 3 · F)` over all that belongs to a fit."""
+        """The sums `(F,)` of `values (N, Q · 3 · F)` over each fit."""
         return np.asarray(values.sum(axis=0, dtype=np.float64).reshape(-1, self.fits).sum(axis=0))
 
     def spread(self, factors: AnyFloats | Bools) -> Floats:
-        """Factors of the fits `(F,)` as those of the columns `(Q · 3 · F,)`."""
+        """Factors of the fits `(F,)` repeated for the columns `(Q · 3 · F,)`."""
         return np.tile(factors.astype(np.float32), self.shape[1] // self.fits)
 
     def _pixels(self, fine: Floats) -> Iterator[Floats]:
@@ -127,7 +122,7 @@ class LeastSquares:
     def _at_anchors(
         self, gather: Callable[[ViewBasis, Floats], Floats], pixels: Iterable[Floats]
     ) -> Floats:
-        """What views have at their pixels, summed up at the finest anchors `(M, Q · 3 · F)`."""
+        """Values at the views' pixels, summed at the finest anchors `(M, Q · 3 · F)`."""
         parts: dict[tuple[int, ...], Floats] = {}
         for view, values in zip(self.views, pixels, strict=True):
             found = gather(view.basis, values)
@@ -154,7 +149,7 @@ def _squared(basis: ViewBasis, values: Floats) -> Floats:
 
 
 def _times(view: ViewSystem, g: Floats) -> Floats:
-    """The matrices of the fits that a view is in, times `g (P, n, 3 · used)`."""
+    """The matrices of a view's fits times `g (P, n, 3 · used)`."""
     each = g.reshape(*g.shape[:2], 3, -1)
     return view.summed(lambda gram, at: gram.times(np.take(each, at, axis=-1)))
 
@@ -170,12 +165,11 @@ def conjugate_gradients(
     start: Floats | None = None,
     on_iteration: Iteration = ignore,
 ) -> Floats:
-    """The coefficients `(N, Q · 3 · F)` that minimise `system`, from `start` (0 where None).
+    """The coefficients `(N, Q · 3 · F)` that minimise `system`, from `start` (None: 0).
 
-    Preconditioned by the diagonal. Each fit ends after `iterations`, or once its preconditioned
-    gradient has fallen to `tolerance` of that at 0: the answer is that of F systems solved one by
-    one. A coefficient that no observation depends on stays 0. `on_iteration` gets the largest
-    gradient.
+    Preconditioned by the diagonal. Each fit ends after `iterations`, or at a preconditioned
+    gradient of `tolerance` times that at 0, as if solved alone. Coefficients without observations
+    stay 0. `on_iteration` gets the largest gradient.
     """
     right = system.right()
     scale: Floats = np.float32(1) / system.diagonal()

@@ -1,4 +1,4 @@
-"""Cross-validation of a field: its ridge, and its gain, by left-out images."""
+"""Cross-validation of a field's ridge and gain by left-out images."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from reconstruction.files.durable import writing
 
 GROUPS = ("new lights", "new views", "both new")
 _LEAST_LIGHTS = 4
-"""Fewer lights are not left out."""
+"""Fewest lights to leave some out."""
 BLOCK = 64_000_000
-"""Bytes of the coefficients of folds that are solved at once."""
+"""Bytes of the coefficients of folds that are solved together."""
 _PATIENCE = 2
-"""Ridges in a row that are worse than the best, after which no weaker one is tried."""
+"""Successive ridges worse than the best after which the search ends."""
 
 
 @dataclass(frozen=True)
 class Folds:
-    """Every part of the views, each with every part of the lights: left out together in turn.
+    """Each part of the views with each part of the lights is left out in turn.
 
-    `views (V,)` and `lights (L,)` are the parts that each belongs to. Of one part none is left out.
+    `views (V,)` and `lights (L,)` are their parts. A single part is never left out.
     """
 
     views: tuple[int, ...]
@@ -43,7 +43,7 @@ class Folds:
 
     @classmethod
     def of(cls, views: int, lights: int, most: int) -> Folds:
-        """At most `most` parts of either; one of fewer than two views or four lights."""
+        """At most `most` parts of either; one for fewer than two views or four lights."""
         of_lights = most if lights >= _LEAST_LIGHTS else 1
         return cls(
             tuple(k % min(most, views) for k in range(views)),
@@ -62,11 +62,11 @@ class Folds:
 
     @property
     def count(self) -> int:
-        """Folds; 0 where nothing can be left out."""
+        """Number of folds; 0 if nothing can be left out."""
         return self.of_views * self.of_lights if self.of_views * self.of_lights > 1 else 0
 
     def parts(self, fold: int) -> tuple[int, int]:
-        """The parts of the views and of the lights that a fold leaves out; -1 is none."""
+        """The left-out parts of the views and of the lights; -1 is none."""
         view, light = divmod(fold, self.of_lights)
         return (view if self.of_views > 1 else -1), (light if self.of_lights > 1 else -1)
 
@@ -75,7 +75,7 @@ class Folds:
         return [i for i, k in enumerate(self.lights) if k == part]
 
     def group(self, fold: int, view: int, part: int) -> int | None:
-        """Of `GROUPS`, what a part of the lights is in a `view`; None where it was fitted."""
+        """Number in `GROUPS` of a part of the lights in a `view`; None if it was fitted."""
         left_out = self.parts(fold)
         new_view, new_light = self.views[view] == left_out[0], part == left_out[1]
         return (0 if new_light else None) if not new_view else (2 if new_light else 1)
@@ -83,10 +83,8 @@ class Folds:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """What fits are made from: views, their bases, and of each the quadratics by part of lights.
-
-    `judges` are those of each view's pixels that judge fits, with their bases.
-    """
+    """Input of fits: views, their bases, their quadratics by part of the lights, and `judges`, each
+    view's validation pixels with their bases."""
 
     views: Sequence[Pictures]
     bases: Sequence[ViewBasis]
@@ -98,9 +96,9 @@ class Data:
     unit: float
 
     def system(self, ridge: float, without: tuple[Folds, range] | None = None) -> LeastSquares:
-        """The fit to everything, or at once the fits to what each of some folds leaves."""
+        """The fit to everything, or together the fits without each of some folds."""
         folds, which = without or (None, range(1))
-        seen = []
+        views = []
         for i, (basis, parts) in enumerate(zip(self.bases, self.grams, strict=True)):
             fits = [
                 tuple(
@@ -111,16 +109,16 @@ class Data:
                 for part in parts
             ]
             if any(fits):
-                seen.append(ViewSystem(basis, list(parts.values()), fits))
-        return LeastSquares(seen, self.nested, self.form, ridge, len(which))
+                views.append(ViewSystem(basis, list(parts.values()), fits))
+        return LeastSquares(views, self.nested, self.form, ridge, len(which))
 
     @property
     def form(self) -> Form:
-        """What the coefficients are of."""
+        """Kind and degree of the coefficients."""
         return Form(self.options.kind, self.options.degree)
 
     def blocks(self, folds: Folds) -> list[range]:
-        """The folds in blocks that are solved at once: as many as `BLOCK` bytes hold."""
+        """The folds in blocks of at most `BLOCK` bytes, which are solved together."""
         one = 4 * self.nested.shape[1] * self.form.count * 3
         each = max(1, BLOCK // one)
         return [range(k, min(k + each, folds.count)) for k in range(0, folds.count, each)]
@@ -133,14 +131,14 @@ class Data:
         )
 
     def judging(self, view: int, fine: Floats) -> PixelField:
-        """The fields of `fine (M, Q · 3 · F)` at the pixels that judge a view."""
+        """The fields of `fine (M, Q · 3 · F)` at a view's validation pixels."""
         pictures, basis = self.judges[view]
         found = (self.unit * basis.at_pixels(fine)).astype(np.float32)
         additive, alone = not self.options.multiplies, self.options.kind == "whole"
         return PixelField(found, pictures.hits.middle(), additive, alone=alone)
 
     def fingerprint(self) -> str:
-        """Of all that a fit depends on."""
+        """A hash of the fit's input."""
         total = hashlib.sha256(repr((self.options, self.scale)).encode())
         for gram in (g for parts in self.grams for g in parts.values()):
             total.update(np.ascontiguousarray(gram.right).tobytes())
@@ -149,11 +147,11 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The `ridge` that is chosen, all that were tried, and the scores of left-out images.
+    """The chosen `ridge`, and the scores of left-out images.
 
-    `tried` are ridges with the mean gain, over groups, of left-out pictures over those without a
-    field, and its standard error, in dB. `validation` and `gain`: see `FieldFit`. `start` are
-    coefficients near the best; `best` is the ridge's number, from the strongest.
+    `tried` are ridges with the mean gain in dB over groups and its standard error. `validation` and
+    `gain`: see `FieldFit`. `start` are coefficients near the best; `best` is the ridge's number,
+    from the strongest.
     """
 
     ridge: float
@@ -167,11 +165,10 @@ class Verdict:
 def cross_validated(
     data: Data, folds: Folds, checkpoint: Path | None, progress: Progress
 ) -> Verdict:
-    """Fit to what each fold leaves, at ridges from the strongest on; judge by what it leaves out.
+    """Fit without each fold, at ridges from the strongest on, and score the left-out images.
 
-    A fold's pictures are judged at the ridge that other pictures of the other folds prefer, so that
-    no picture has a part in the field that it judges. Killed, it goes on behind the ridges that
-    `checkpoint` has.
+    Nested: a fold is scored at the ridge chosen by other images of the other folds. A killed run
+    resumes after the ridges in `checkpoint`.
     """
     ridges = sorted(data.options.ridges, reverse=True)
     blocks = data.blocks(folds)
@@ -196,7 +193,7 @@ def cross_validated(
             )
         squares, _ = _squares(data, folds, found)
         progress(
-            f"ridge {ridge:g}: left-out pictures gain {_mean_gain(squares, without)[0]:.2f} dB",
+            f"ridge {ridge:g}: left-out images gain {_mean_gain(squares, without)[0]:.2f} dB",
             (k + 1) * share,
         )
         state = _State(np.concatenate([state.squares, squares[None]]), found)
@@ -216,11 +213,9 @@ def _iterations(
 
 
 def _squares(data: Data, folds: Folds, found: Sequence[Floats] | None) -> tuple[Array, Array]:
-    """Errors of displayed values, and how many: by fold, view, light and group `(F, V, L, G)`.
-
-    With each fold's coefficients, in blocks, or without a field. They are squares, of which the
-    noise of rendered pictures is no part: products of two halves' errors.
-    """
+    """Squared errors of displayed values (products of two halves' errors, without noise) and their
+    counts by fold, view, light and group `(F, V, L, G)`, for each fold's coefficients in blocks, or
+    without a field."""
     shape = folds.count, len(folds.views), len(folds.lights), len(GROUPS)
     squares, counts = np.zeros((2, *shape))
     fine = [] if found is None else [np.asarray(data.nested @ x) for x in found]
@@ -243,7 +238,7 @@ def _squares(data: Data, folds: Folds, found: Sequence[Floats] | None) -> tuple[
 
 
 def gains(squares: Array, without: Array) -> Array:
-    """How much smaller sums of squares are than those `without`, of any one shape, in dB."""
+    """Gain in dB of sums of squares over those `without`, of any one shape."""
     ratio = np.maximum(without, 1e-30) / np.maximum(squares, 1e-30)
     return np.asarray(10 * np.log10(np.clip(ratio, 1e-10, 1e10)))
 
@@ -261,8 +256,7 @@ def _mean_gain(squares: Array, without: Array) -> tuple[float, float]:
 def spread_of(squares: Array, without: Array, of: Callable[[Array, Array], Array]) -> Array:
     """The standard error of `of` the sums `(..., G)` of squares and of those without.
 
-    By leaving out one view in turn, and one light in turn: the two add up, as views and lights are
-    both drawn from all that there might be. Infinite where there is one view and one light.
+    Jackknife variances over views and over lights add up. Infinite for one view and one light.
     """
     total: Any = np.inf if max(without.shape[1:3]) < 2 else 0.0
     for others in ((0, 2), (0, 1)):
@@ -274,10 +268,8 @@ def spread_of(squares: Array, without: Array, of: Callable[[Array, Array], Array
 
 
 def _chosen(candidates: Array) -> int:
-    """Of errors `(R, F, V, L, G)` under fits from the strongest ridge on, the one to be used.
-
-    The strongest over which the best does not gain more than the standard error of that gain.
-    """
+    """Index into errors `(R, F, V, L, G)`, strongest ridge first: the strongest whose loss against
+    the best is within its standard error."""
     best = int(np.argmax([_mean_gain(x, candidates[0])[0] for x in candidates]))
     for k in range(best):
         gain, spread = _mean_gain(candidates[best], candidates[k])
@@ -287,10 +279,8 @@ def _chosen(candidates: Array) -> int:
 
 
 def _elsewhere(squares: Array, without: Array, folds: Folds, fold: int) -> Array:
-    """A fold's errors `(V, L, G)` at the ridge that the others choose, which may be no field.
-
-    They choose by pictures of views and lights that this fold does not leave out.
-    """
+    """A fold's errors `(V, L, G)` at the ridge (or no field) chosen by the other folds on views and
+    lights that this fold does not leave out."""
     view, light = folds.parts(fold)
     others = np.arange(folds.count) != fold
     views, lights = np.array(folds.views) != view, np.array(folds.lights) != light
@@ -315,13 +305,13 @@ def _validation(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The left-out squares of the ridges done `(R, F, V, L, G)`, each block's latest solution."""
+    """The squares of the ridges done `(R, F, V, L, G)`, and each block's latest solution."""
 
     squares: Array
     latest: list[Floats]
 
     def save(self, path: Path | None, fingerprint: str) -> None:
-        """Write it, whole or not at all; nothing where `path` is None."""
+        """Write it durably; nothing if `path` is None."""
         if path is None:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -331,7 +321,7 @@ class _State:
 
     @classmethod
     def load(cls, path: Path | None, fingerprint: str, none: Array) -> _State:
-        """Read it; nothing done where there is no file, or one of another fit."""
+        """Read it; an empty state without a file of the same fit."""
         if path is None or not path.is_file():
             return cls(none, [])
         with np.load(path) as data:

@@ -1,4 +1,4 @@
-"""Pictures by Photobooth's reflectance field: captured frames interpolated on a model's strands."""
+"""Images by Photobooth's reflectance field: captured frames interpolated on a model's strands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from appearance.fields.hits import find_hits
 from appearance.fields.interpolation import FLOOR, HITS, Interpolation, irradiance, weighted
 from appearance.fields.neighbours import light_weights
 from appearance.fields.reflectance import gather
-from appearance.fields.search import refined, searched
+from appearance.fields.search import searched
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
@@ -39,19 +39,17 @@ from reconstruction.options import options
 from reconstruction.report.progress import part_of
 
 ROWS = 16
-"""Rows of what an environment map becomes, one far light from each cell: 11°, as the lamps of a
-stage of 331 are apart."""
+"""Rows of cells of an environment map, a far light each: 11°, the spacing of 331 lights."""
 FAR = 1e3
 """Metres to the lights of an environment."""
 GUIDE = 4
-"""Paths a pixel of the pictures that guide frames: these are blurred."""
+"""Paths a pixel of the guide's images, which are blurred."""
 SAME = 0.999
-"""The weight from which on one captured light stands for a new one: it is at the same place."""
+"""Weight from which a captured light coincides with a new one."""
 _DARK = 1e-12
-"""W/m² of a light that is none."""
+"""W/m² of a dark light."""
 EXTENT = 12.0
-"""The hair's extent (the root of its area) over the blur of the guide. Tried on one capture, where
-8 to 30 do within 0.2 dB of each other, and FLOORs of 0.1 to 0.6."""
+"""The hair's extent (the root of its area) over the guide's blur."""
 
 
 @options
@@ -59,13 +57,11 @@ class InterpolationOptions:
     """How captured frames are interpolated.
 
     `guide`: "kajiya_kay" (Photobooth §4.2), its parameters searched with `left_out` lights left out
-    one at a time; or "none", standard interpolation (§4.1). `refine` turns every camera's tangents
-    to its frames, which is slow and gains little.
+    one at a time; or "none", standard interpolation (§4.1).
     """
 
     guide: Literal["kajiya_kay", "none"] = "kajiya_kay"
     left_out: Annotated[int, Field(ge=1, le=64)] = 4
-    refine: bool = False
 
 
 def interpolation_of(
@@ -80,9 +76,9 @@ def interpolation_of(
 ) -> Interpolation:
     """The frames of `capture` that are not `held_out`, ready to be interpolated on its strands.
 
-    They are kept in the model's folder `samples`, by camera, mapped into memory. `stage` gets the
-    guide's parameters with their spread, the bytes, and warnings. Raises `ModelError` where no
-    camera sees hair.
+    They are stored in the model's folder `samples`, by camera, mapped into memory. `stage` gets the
+    guide's parameters with their spread, the bytes, and warnings. Raises `ModelError` if no camera
+    sees hair.
     """
     options, training = options or InterpolationOptions(), (held_out or HeldOut()).training(capture)
     training = training.view(undistorted=True)
@@ -104,13 +100,12 @@ def interpolation_of(
     count = len(field.lights)
     most = min(options.left_out, count - 2)
     if most < 1:
-        stage.warn("too few lights to leave one out: standard interpolation")
+        stage.warn("too few lights to leave one out: standard interpolation is used")
         return found
     names = [field.lights[int((i + 0.5) * count / most)].name for i in range(most)]
-    search = searched(found, names, progress=part_of(progress, 0.5, 0.8))
+    search = searched(found, names, progress=part_of(progress, 0.5, 1.0))
     search.record(stage)
-    found = replace(found, model=search.best)
-    return refined(found, part_of(progress, 0.8, 1.0)) if options.refine else found
+    return replace(found, model=search.best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +129,10 @@ def with_samples(
     camera: Camera,
     lights: Sequence[Light],
 ) -> tuple[Floats, dict[str, Any]]:
-    """The picture `base (H, W, 3)` of a model, its hair replaced by what captured frames say.
+    """The image `base (H, W, 3)` of a model, its hair interpolated from captured frames.
 
-    Under all `lights` together. `base` stays where there is no hair, and where no camera saw it
-    in the pose of the capture. Also returned: "hair_unseen", the part of the hair that is.
+    Under all `lights` together. `base` stays off the hair, and where no camera captured it. Also
+    returned: "hair_unseen", the share of the hair that no camera captured.
     """
     image = np.array(base, np.float32)
     flat = image.reshape(-1, 3)
@@ -161,13 +156,12 @@ def with_samples(
 
 @dataclass(frozen=True, eq=False)
 class GuidedFrames:
-    """A camera's own frames in `capture`, changed as the model says the light changes.
+    """A camera's own frames in `capture`, relit by the model.
 
-    Each of the nearest captured lights' frames is multiplied by the ratio of the model's pictures
-    under the new and the captured light, both blurred by a twelfth of the hair's extent: strands
-    that are a pixel off would else write their own detail into the frame. Frames and pictures are
-    divided by their light's irradiance first; `FLOOR` parts of the mean on both sides of the ratio
-    bound its gain. `scene` is that of `fitted`, the hair is where `mask (H, W)` has it.
+    Each frame of the nearest captured lights is multiplied by the ratio of the model's images under
+    the new and the captured light, both over irradiance and blurred by a twelfth of the hair's
+    extent, against errors of the strands. `FLOOR` bounds the ratio. `scene` is that of `fitted`,
+    `mask (H, W)` the hair's.
     """
 
     scene: HairScene
@@ -177,10 +171,10 @@ class GuidedFrames:
     mask: Bools
 
     def __call__(self, base: AnyFloats, lights: Sequence[Light]) -> Floats:
-        """The picture `base (H, W, 3)`, its hair made of frames, under all `lights` together.
+        """The image `base (H, W, 3)`, its hair from frames, under all `lights` together.
 
-        `base` stays where no frame says anything: all are saturated. Raises `ModelError` for a
-        camera without frames, and where there is no hair.
+        `base` stays where all frames are saturated. Raises `ModelError` for a camera without frames
+        or hair.
         """
         name, capture, mask = self.camera.name, self.capture, self.mask
         if not mask.any():
@@ -214,7 +208,7 @@ class GuidedFrames:
         return image
 
     def _shown(self, lights: Sequence[Light], middle: AnyFloats) -> Floats:
-        """The model's blurred pictures `(L, P, 3)` of the mask's pixels, over irradiance."""
+        """The model's blurred images `(L, P, 3)` of the mask's pixels, over irradiance."""
         sigma = float(np.sqrt(self.mask.sum())) / EXTENT
         pixels = np.flatnonzero(self.mask)
         lit = render_olat(self.scene, self.camera, lights, spp=GUIDE, pixels=pixels)
@@ -239,22 +233,20 @@ def _irradiances(lights: Sequence[Light], point: AnyFloats) -> Floats:
 
 
 def _source(interpolation: Interpolation, camera: Camera) -> Any:
-    """The captured view that is `camera`'s, or None."""
+    """The captured view of `camera`, or None."""
     known = camera.to_dict()
     return next((s for s in interpolation.sources if s.view.camera.to_dict() == known), None)
 
 
 def all_lights(lights: Sequence[Light], environments: Sequence[Environment]) -> list[Light]:
-    """What `with_samples` takes for lights and whole environment maps together."""
+    """The lights for `with_samples` of lights and environment maps together."""
     parts = [small for light in lights for small in panel(light)]
     return parts + [light for e in environments for light in environment_lights(e)]
 
 
 def environment_lights(environment: Environment, rows: int = ROWS) -> list[Light]:
-    """Far lights that shine as the map does: one from each of `rows` x 2 `rows` cells that is lit.
-
-    A cell's light comes from its brightness-weighted middle; their sum is the map's irradiance.
-    """
+    """Far lights of the map's total irradiance: one per lit cell of `rows` x 2 `rows`, in the
+    direction of its radiance-weighted mean."""
     envmap = check_environment(environment.envmap, "environment")
     lit = _texels(replace(environment, envmap=subdivided(envmap, rows)))
     cells = [
@@ -269,7 +261,7 @@ def environment_lights(environment: Environment, rows: int = ROWS) -> list[Light
 
 
 def _texels(environment: Environment) -> tuple[Array, Array, Array]:
-    """Of a map's texels: solid angle `(h, w)`, radiance times it and direction `(h, w, 3)`."""
+    """Solid angles `(h, w)` of a map's texels, radiance times these, and directions `(h, w, 3)`."""
     envmap = check_environment(environment.envmap, "environment").astype(float)
     height, width = envmap.shape[:2]
     edges = np.linspace(0, np.pi, height + 1)
@@ -294,7 +286,7 @@ def _far(name: str, weight: Array, colour: Array, direction: Array) -> list[Ligh
 
 
 def panel(light: Light, across: int = 3) -> list[Light]:
-    """A rectangular light as `across`² smaller ones, all others as they are."""
+    """A rectangular light as `across`² smaller ones; other lights unchanged."""
     if light.size is None or light.orientation is None:
         return [light]
     at = (np.arange(across) + 0.5) / across - 0.5

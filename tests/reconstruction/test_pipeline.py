@@ -342,7 +342,7 @@ def test_no_sweep_is_said(
     capture = shoot(cameras=around[:3], sweep=False, lights=LIGHTS[:4], extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
     report = reconstruct(capture, Model(tmp_path), options=COARSE)
-    assert [x.why for x in report["triangulation"].left_out] == ["no sweep was shot"]
+    assert [x.why for x in report["triangulation"].left_out] == ["no sweep was captured"]
 
 
 def test_what_cannot_be_done_without_is_named(
@@ -381,7 +381,7 @@ def test_no_strand_is_an_error_that_says_what_to_do(
 ) -> None:
     nothing = Measured(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     monkeypatch.setattr("reconstruction.stages.line_strands", lambda *_, **__: ([], nothing))
-    with pytest.raises(CaptureError, match="no strand was found: the method 'hull'"):
+    with pytest.raises(CaptureError, match="the method 'hull'"):
         reconstruct(unswept, Model(tmp_path), method="photometric")
     assert not (tmp_path / "strands.npz").exists()
 

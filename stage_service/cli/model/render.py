@@ -58,9 +58,6 @@ def add(commands: Commands) -> None:
         "renders, for a camera of the capture",
     )
     render.add_argument(
-        "--refine", action="store_true", help="refine the guide's tangents on each camera's frames"
-    )
-    render.add_argument(
         "--strands",
         type=Path,
         help="a strand file of another pose: the same strands, moved; an .npz of poses (T, N, 3) "
@@ -118,10 +115,8 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError(f"--seed {args.seed}: expected 0 or more")
     if args.spp is not None and args.spp < 1:
         raise ValueError(f"--spp {args.spp}: expected 1 or more")
-    if (args.guide or args.refine) and args.field != "interpolation":
-        raise ValueError("--guide and --refine need --field interpolation")
-    if args.refine and args.guide in ("none", "model"):
-        raise ValueError(f"--refine needs --guide kajiya_kay, not {args.guide}")
+    if args.guide and args.field != "interpolation":
+        raise ValueError("--guide needs --field interpolation")
     only_lights = args.light and args.environment is None and args.strands is None
     if args.guide == "model" and not (only_lights and args.camera):
         raise ValueError(
@@ -256,7 +251,7 @@ def _still(
         mask = model.mask(camera.name, "hair", capture)
         guided = GuidedFrames(fitted.scene(), fitted, capture, camera, mask)
         return guided(image, lights), {"field": "interpolation", "guide": "model"}
-    options = InterpolationOptions(guide=args.guide or "kajiya_kay", refine=args.refine)
+    options = InterpolationOptions(guide=args.guide or "kajiya_kay")
     all_lit = camera, all_lights(lights, maps)
     return _interpolated(image, options, (pose, model, capture), all_lit, progress)
 

@@ -319,7 +319,7 @@ def test_frames_that_no_factor_explains_are_told(planted):
     half = [replace(v, captured=(v.halves[0] * lit).astype(np.float32)) for v in views]
     found = fitted(planted, half, replace(ROUGH, degree=2))
     assert found.clamped > 0.01
-    assert any("modulated below black" in w for w in found.warnings)
+    assert any("negative modulation" in w for w in found.warnings)
     assert found.validation["new lights"]["with"] > found.validation["new lights"]["without"]
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.hits import HitOptions, find_hits
-from appearance.fields.interpolation import HITS, Interpolation, irradiance, turned
+from appearance.fields.interpolation import HITS, Interpolation, irradiance
 from appearance.fields.kajiya_kay import KajiyaKay
 from appearance.fields.neighbours import camera_weights, light_weights
 from appearance.fields.reflectance import CapturedView, ReflectanceField
-from appearance.fields.search import DIFFUSE, EXPONENT, blocks, refined, searched, worst_block
+from appearance.fields.search import DIFFUSE, EXPONENT, blocks, searched, worst_block
 from appearance.model.interpolated import environment_lights, panel
 from appearance.render.environment_maps import studio
 from appearance.render.mixed import Environment
@@ -183,56 +183,6 @@ def test_search_and_pictures_are_of_one_mind(planted):
     block = blocks(one.sources[0].view.pixels, 20)
     expected = worst_block(made[0] - truth, block) / worst_block(truth, block)
     assert found.errors[0, 2, 5] == pytest.approx(expected, rel=0.02)
-
-
-def turn_errors(planted, lights, broken=lambda table: table):
-    """Mean angles to tangents that are off by 8 degrees, before and after refining, in degrees.
-
-    Frames under `lights` in the places of the planted ones; `broken` takes samples away.
-    """
-    source = planted.sources[1]
-    hits, axis = source.hits, np.array([0.0, 1.0, 0.0], np.float32)
-    off = replace(hits, table=hits.table.copy())
-    off.table["tangent"] = turned(np.radians(8) * axis, hits.column("tangent"))
-    table = broken(np.stack([kajiya_kay_picture(off, x) for x in lights]).astype(np.float16))
-    source = replace(source, view=replace(source.view, table=table))
-    field = replace(planted.field, lights=lights)
-    before = replace(planted, field=field, sources=(source,), model=TRUE)
-    angles = []
-    for one in (before, refined(before)):
-        mine = turned(one.sources[0].turn[:, None], hits.column("tangent"))
-        cosine = np.abs((mine * off.column("tangent")).sum(-1))[hits.column("weight") > 0]
-        angles.append(np.degrees(np.arccos(np.clip(cosine, 0, 1))).mean())
-    return angles
-
-
-def test_turned_strands_are_turned_back(planted):
-    """Refining finds much of the way to them."""
-    before, after = turn_errors(planted, planted.field.lights)
-    assert before > 6
-    assert after < 0.6 * before
-
-
-def test_how_bright_lights_are_does_not_turn_strands(planted):
-    """What a fibre reflects of a light says where it points, not what the light brings."""
-    rng = np.random.default_rng(0)
-    lights = tuple(
-        replace(x, intensity=x.intensity * np.exp(rng.normal(scale=1.2)))
-        for x in planted.field.lights
-    )
-    before, after = turn_errors(planted, lights)
-    assert after < 0.6 * before
-
-
-def test_saturated_highlights_do_not_turn_strands(planted):
-    """A sample that is not known is not black."""
-
-    def saturated(table):
-        bright = table.astype(float).mean(axis=-1)
-        return np.where((bright > np.quantile(bright, 0.85, axis=0))[..., None], np.nan, table)
-
-    before, after = turn_errors(planted, planted.field.lights, saturated)
-    assert after < 0.7 * before
 
 
 def test_a_place_that_no_camera_sees_is_told(planted, tuft):

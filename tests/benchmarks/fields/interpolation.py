@@ -22,7 +22,7 @@ from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.hits import find_hits
 from appearance.fields.interpolation import HITS, Interpolation
 from appearance.fields.reflectance import CapturedView, ReflectanceField
-from appearance.fields.search import blocks, refined, searched
+from appearance.fields.search import blocks, searched
 from appearance.render.coverage import coverage
 from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling
@@ -131,7 +131,6 @@ def variants(shot: Captured, progress: Progress) -> tuple[dict[str, Interpolatio
     return {
         "standard, radial (Photobooth §4.1)": standard,
         "Kajiya-Kay, radial (Photobooth §4.2)": guided,
-        "Kajiya-Kay, radial, turned": refined(guided),
     }, stage
 
 

@@ -291,15 +291,10 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
         (("--seed", "-1"), "--seed -1: expected 0 or more"),
         (("--spp", "0"), "--spp 0: expected 1 or more"),
         (("--size", "100000"), "--size 100000: expected 16 to 16384"),
-        (("--guide", "none"), "need --field interpolation"),
-        (("--refine",), "need --field interpolation"),
+        (("--guide", "none"), "--field interpolation"),
         (("--frames", "9"), "--frames needs --turntable"),
         (("--turntable", "--frames", "1"), "--frames 1: expected 2 to 1000"),
         (("--capture", "{capture}", "--camera", "c0", "--size", "64"), "--size and --camera"),
-        (
-            ("--capture", "{capture}", "--field", "interpolation", "--guide", "none", "--refine"),
-            "--guide kajiya_kay, not none",
-        ),
     ],
 )
 def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
