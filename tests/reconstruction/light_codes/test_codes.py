@@ -23,12 +23,12 @@ def test_packing_is_undone_for_any_number_of_lights(count: int, seed: int) -> No
 
 
 @given(st.integers(1, 400), st.integers(0, 2**32 - 1))
-def test_matching_counts_the_asked_bits_alone(count: int, seed: int) -> None:
+def test_matching_counts_the_compared_bits_alone(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    a, b, asked = (rng.random((5, count)) < 0.5 for _ in range(3))
-    found = match(pack(a), pack(b), pack(asked))
+    a, b, compared = (rng.random((5, count)) < 0.5 for _ in range(3))
+    found = match(pack(a), pack(b), pack(compared))
     for row in range(5):
-        wanted = (a == b)[row][asked[row]].mean() if asked[row].any() else 1.0
+        wanted = (a == b)[row][compared[row]].mean() if compared[row].any() else 1.0
         assert found[row] == pytest.approx(wanted)
 
 
@@ -89,7 +89,7 @@ def test_shapes_that_disagree_are_refused() -> None:
         code_map(np.zeros((2, 3, 3)), np.zeros((3, 4), bool), 0)
 
 
-def test_a_light_without_a_frame_in_one_view_is_not_asked_of_a_pair() -> None:
+def test_a_light_without_a_frame_in_one_view_is_not_compared_in_a_pair() -> None:
     """What one view has of it must not count as a difference; whoever stands beside it may see."""
     mask = np.ones((2, 2), bool)
     lit = np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 0.1]]])
@@ -103,8 +103,8 @@ def test_a_light_without_a_frame_in_one_view_is_not_asked_of_a_pair() -> None:
     views = [View(camera, mask, lines, codes, -1) for codes in (whole, part)]
     types = array_types()
     device = DeviceViews(types, views)
-    asked = device.asked(types.UInt32([0, 1, 0]), types.UInt32([1, 0, 0]))
-    words = np.stack([np.asarray(w) for w in asked], axis=1).astype(np.uint32)
+    compared = device.compared_lights(types.UInt32([0, 1, 0]), types.UInt32([1, 0, 0]))
+    words = np.stack([np.asarray(w) for w in compared], axis=1).astype(np.uint32)
     bits = unpack(words, 3)
     assert not bits[:2, 0].any()
     assert bits[:2, 1].all()

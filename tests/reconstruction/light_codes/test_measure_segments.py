@@ -93,7 +93,7 @@ def test_fibres_are_found_in_views_that_are_all_saturated(fibres: Any, tmp_path:
 
 def test_what_cannot_be_done_without_is_named(fibres: Any, tmp_path: Path) -> None:
     dark = fibres.shoot(tmp_path / "dark", brightness=0.0)
-    with pytest.raises(CaptureError, match="no hair pixel has a direction|no segment of"):
+    with pytest.raises(CaptureError, match=r"no hair pixel has a direction|no segment of"):
         run(dark, tmp_path / "m")
     for name in (c.name for c in fibres.cameras):
         mask = tmp_path / "dark" / "masks" / f"{name}.png"
@@ -129,7 +129,7 @@ def test_strands_are_cut_at_the_balls_surface() -> None:
     assert len(Ball((0, 0, 0), 0.02).cut(Strands.from_list([outside]))) == 0
 
 
-def test_part_of_a_capture_keeps_what_was_asked(shot: Capture) -> None:
+def test_part_of_a_capture_keeps_the_options(shot: Capture) -> None:
     some = part_of(shot, cameras=3, lights=5)
     assert [c.name for c in some.rig.cameras] == ["c0", "c4", "c7"]
     assert len(some.olat_lights()) == 5

@@ -46,8 +46,8 @@ def looked_up(search: DepthSearch, view: int, k: int, code: Any, points: Array) 
     on &= (at[:, 0] < other.camera.width) & (at[:, 1] < other.camera.height)
     at[~on] = 0
     line = np.where(on[:, None], other.lines[at[:, 1], at[:, 0]], 0)
-    asked = own.codes.varying | other.codes.varying
-    equal = match(other.codes.words[at[:, 1], at[:, 0]], code, asked)
+    compared = own.codes.varying | other.codes.varying
+    equal = match(other.codes.words[at[:, 1], at[:, 0]], code, compared)
     return xy, line, np.where(line.any(axis=1), equal, 0)
 
 

@@ -91,7 +91,7 @@ def test_a_sweep_that_lights_nothing_gives_an_empty_cloud(shoot: Shoot) -> None:
     stage = Stage("triangulation")
     cloud = triangulate(shoot(brightness=0.0), stage=stage)
     assert len(cloud) == 0
-    assert any("no lit pixel" in w for w in stage.warnings)
+    assert any("no stripe of" in w for w in stage.warnings)
 
 
 def test_a_capture_without_a_sweep_says_so(shoot: Shoot) -> None:
