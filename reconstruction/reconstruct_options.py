@@ -108,8 +108,8 @@ class ReconstructOptions:
     `held_out` cameras are not used. `grid` is the voxels' edge; `roots` strands are grown from the
     scalp, then gaps are filled. `max_length` is the hair's. `margin` is the envelope's extent in
     front of the visible surface. `scalp_points` is a file of digitised scalp points to fit a head
-    to, `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled `within` metres
-    of a measurement (None: 3 mm or two voxels, on a hull 12 mm); give more for wider pixels.
+    to, `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled `within`
+    metres of a measurement (None: 3 mm or two voxels, on a hull 12 mm); give more for wider pixels.
     `radius` of the strands; None keeps a head of hair's coverage.
     """
 
