@@ -26,5 +26,3 @@ small = fixtures("appearance").small
 spheres = fixtures("reconstruction")
 shoot, two_cameras = spheres.shoot, spheres.two_cameras
 fibres = fixtures("reconstruction/light_codes").fibres
-stage = fixtures("reconstruction/calibration")
-true_rig, nominal_rig = stage.true_rig, stage.nominal_rig

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.backends import jobs
 from benchmarks.backends.jobs import Done
-from benchmarks.backends.side_by_side import compared, done_by, report
+from benchmarks.backends.side_by_side import compared, done_by
 
 from reconstruction.array_backend import VARIANT, prefer_cuda
 
@@ -53,12 +53,6 @@ def test_a_quick_run_leaves_what_the_cpu_does_and_says_what_is_not_here(tmp_path
     assert (CUDA in job) != (f"{CUDA}: not here" in told)
 
 
-def test_a_gpu_alone_that_is_not_there_is_a_failure(monkeypatch, tmp_path, capsys) -> None:
-    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
-    assert main(["backends", "--quick", "--variants", CUDA, "--out", str(tmp_path)]) == 1
-    assert "leave --variants out" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", [LLVM, CUDA])
 def test_a_job_runs_in_a_process_of_its_own_whose_variant_it_is(variant, monkeypatch) -> None:
@@ -69,18 +63,6 @@ def test_a_job_runs_in_a_process_of_its_own_whose_variant_it_is(variant, monkeyp
 
 def _tells() -> Done:
     return Done(0, 0, np.zeros(0, np.float32), {os.environ[VARIANT]: 1})
-
-
-@pytest.mark.slow
-def test_a_job_that_fails_is_told_with_its_error() -> None:
-    with pytest.raises(ValueError, match="no back end"):
-        done_by(LLVM, partial(_fails, "no back end"))
-    jobs_of = {"bsdf": {LLVM: {"failed": "ValueError: no back end"}}}
-    assert "ValueError: no back end" in report({"processors": {LLVM: "CPU"}, "jobs": jobs_of})
-
-
-def _fails(why: str) -> Done:
-    raise ValueError(why)
 
 
 def test_a_worker_takes_a_gpu_where_there_is_one_and_nothing_else_was_chosen(monkeypatch) -> None:

@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.light_planes.motion_errors import PAPER_PIXELS, motion_errors, true_motion
-from benchmarks.light_planes.stage_costs import Growth, measure_growth, regridded
 
 from reconstruction import Capture
-from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.light_planes import Motion
 
 
@@ -52,21 +50,3 @@ def test_the_true_motion_is_that_of_each_tracking_pulse(
     there_and_back = [0, 1, 2, 1, 0, 1, 2, 1]
     expected = [1e-3 * there_and_back[k % 8] for k in range(len(steps))]
     np.testing.assert_allclose(motion.translations[:, 0], expected)
-
-
-def test_exponents_are_slopes() -> None:
-    growth = Growth("field", "voxels", (100, 1000), (1.0, 100.0), (None, None))
-    assert growth.exponent == pytest.approx(2.0)
-    sizes: list[int] = []
-    measured = measure_growth("x", "y", (1, 2), sizes.append)
-    assert sizes == [1, 2]
-    assert all(s >= 0 for s in measured.seconds)
-
-
-def test_a_volume_keeps_its_place_and_size_on_other_voxels() -> None:
-    inside = np.zeros((20, 30, 40), bool)
-    inside[4:16, 6:24, 8:32] = True
-    grid = VoxelGrid(np.array([0.1, -0.2, 0.3]), 2e-3, inside)
-    finer = regridded(grid, 1e-3)
-    assert finer.volume == pytest.approx(grid.volume)
-    np.testing.assert_allclose(finer.centers().mean(axis=0), grid.centers().mean(axis=0), atol=1e-9)
