@@ -1,8 +1,7 @@
-"""The hair BSDF of a whole fibre's width: what one pixel sees of a fibre thinner than it.
+"""The hair BSDF averaged over a fibre's width, for fibres thinner than a pixel.
 
-Seen across, a fibre shows every offset h in [-1, 1] alike. Each lobe is a longitudinal part M_p,
-which does not depend on h, times the mean over h of A_p N_p, which is tabulated here, for the whole
-width or for parts of it.
+The offset h is uniform in [-1, 1] across a fibre. Each lobe is a longitudinal part M_p, independent
+of h, times the mean over h of A_p N_p, tabulated here for the whole width or parts of it.
 """
 
 from __future__ import annotations

@@ -104,10 +104,10 @@ class HairMaps:
 
 @dataclass(frozen=True, eq=False)
 class MappedStrands:
-    """The strands of a scene with their places in the volume; `painted` puts maps on them.
+    """The strands of a scene with their coordinates in the volume.
 
-    `root_uv (S, 2)` are the roots' places on the scalp's map, `coordinates` what the BSDF needs to
-    know of the curves (`strand_parameters`).
+    `root_uv (S, 2)` are the roots on the scalp's map, `coordinates` the BSDF's parameters of the
+    curves (`strand_parameters`).
     """
 
     scene: HairScene

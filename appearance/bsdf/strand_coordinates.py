@@ -35,7 +35,7 @@ def strand_parameters(
     root_uv: ArrayLike | None = None,
     root_normals: ArrayLike | None = None,
 ) -> dict[str, Any]:
-    """What `extended_hair` needs to know of the curves, ready to be merged into its dictionary.
+    """Parameters of the curves for the dictionary of `extended_hair`.
 
     `control_points (N, 4)` and `segments (K,)` (the first of each segment's four control points)
     are those of the `bsplinecurve` in the scene, in its units; `segments_of_strand (S,)` counts the

@@ -29,7 +29,7 @@ SAMPLE = 20000
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is seen: by a `camera`, under an `environment (h, w, 3)` as our renderers take it."""
+    """A `camera` and an `environment (h, w, 3)` in our renderers' convention."""
 
     camera: Camera
     environment: AnyFloats

@@ -1,10 +1,9 @@
-"""Rotation correctives: the turn of each cell's fibres, from the light of the first hit.
+"""Rotation correctives: a rotation of each cell's fibres, fitted to first-hit light.
 
-That light is what a turn changes most, and it has hardly any noise. Paths of one vertex depend on
-the geometry alone: they are drawn once, and Gauss-Newton on them has exact derivatives. Light that
-comes by other fibres is rendered, smoothed over a pixel and held fixed. Frames under a part of the
-lights, which the steps do not see, say how much of a step is taken: what no turn explains is alike
-over many lights and pixels, and a step can fit it as it can fit noise.
+First-hit light depends most on rotations and has little noise. Its paths depend on the geometry
+only: they are drawn once, and Gauss-Newton on them has exact derivatives. Indirect light is
+rendered, smoothed over a pixel and held fixed. Frames under validation lights select the step
+size, because systematic errors over many lights and pixels can be overfitted like noise.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ PRIOR_WEIGHT = 1e-3
 """Of half the mean squared corrective, in widths, beside the image loss."""
 _TURNS, _ITERATIONS = 2, 30
 _APART = 4
-"""Every so many lights are left out of the steps, and judge them."""
+"""Every so many lights are validation lights."""
 _SHARES = (2.0, 1.0, 0.5)
 """Noise in the derivatives makes steps too short."""
 _ALIKE = 1e-4
@@ -38,10 +37,9 @@ _ALIKE = 1e-4
 
 @dataclass(frozen=True)
 class Correctives:
-    """The result: the unconstrained numbers `raw`, and the error under the judging lights.
+    """The unconstrained numbers `raw`, and the error under the validation lights.
 
-    `taken` are the shares of the steps that were taken: none, and `raw` is what it was, where
-    correctives do the judging lights no good.
+    `taken` are the step sizes; empty, with `raw` unchanged, if no step reduces the error.
     """
 
     raw: Raw
@@ -61,9 +59,8 @@ def solve_correctives(
 ) -> Correctives:
     """`raw` with correctives for the cells of its volume, at `gain (L,)`.
 
-    `lambda_r` weighs the mean difference between layers, and between neighbours on the scalp:
-    reconstructed strands are wrong alike there. Takes the time of a picture of a quarter
-    of `effort.spp` paths (at least 16) of every view, and of a few of 16 paths of one vertex.
+    `lambda_r` weights the mean difference between layers and between neighbours on the scalp, where
+    reconstructed strands have similar errors.
     """
     lights = np.arange(len(problem.lights))
     judge = lights % _APART == _APART - 1
@@ -106,13 +103,13 @@ class _View:
         self.weight: Array | None = None
 
     def pictures(self, maps: HairMaps, derivatives: bool) -> tuple[LinearisedPictures, Array]:
-        """The light of the first hit, and what all light is off `(2, L, P, 3)`."""
+        """First-hit light, and the difference of all light `(2, L, P, 3)`."""
         pictures = self.direct.linearised(maps, ("rotation",) if derivatives else ())
         halves = pictures.picture() + self.rest
         compared = self.problem.compare(self.direct.patch, halves.mean(axis=0))
         off = halves - compared.captured
         if self.weight is None:
-            # of the start: weights that followed would choose among noise
+            # fixed at the start: later weights would select noise
             weight = np.where(compared.valid[..., None], losses.weights(compared.level), 0)
             self.weight = losses.noise_weighted(weight, off[0] * off[0])
         return pictures, off
@@ -141,8 +138,7 @@ def _step(views: list[_View], maps: HairMaps, lambda_r: float) -> Array:
     for view in views:
         pictures, off = view.pictures(maps, True)
         assert view.weight is not None
-        # derivative and difference are of different halves of the paths: noise that both had
-        # would be taken for a reason to move
+        # derivative and difference are of different halves of the paths: their noise is independent
         moment += pictures.rotation_gradient(0.5 * view.weight * off[::-1], shape)
         error += float((view.weight * off[0] * off[1]).sum())
         count += view.weight.size
@@ -150,7 +146,7 @@ def _step(views: list[_View], maps: HairMaps, lambda_r: float) -> Array:
     # the image loss is the root of the mean square
     scale = 1 / (max(count, 1) * max(error / max(count, 1), losses.LEAST_ERROR**2) ** 0.5)
     prior = PRIOR_WEIGHT / (x.size * WIDTH**2)
-    # |d| as a parabola that has its slope at the present d
+    # |d| as a parabola with its derivative at the present d
     stiff = [
         lambda_r / between.size / np.sqrt(between**2 + _ALIKE) if between.size else between
         for between in (np.diff(x, axis=axis) for axis in range(3))

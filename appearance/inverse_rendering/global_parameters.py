@@ -1,11 +1,11 @@
 """Roughness, index, mean colour and light intensities: the global parameters, from images.
 
-Gauss-Newton on kept paths, its derivatives on the left and on the right estimated apart: the square
-of a path tracer's derivative is mostly noise. On the left stand instruments Z, the hardly noisy
-derivative of the light of the first hit; with weights W and the difference r of rendered and
-captured, Zᵀ W r is zero on average at the truth, whatever Z is. On the right stand the exact
-derivatives of whole pictures. Z is of one half of the paths, r and the right side of the other, and
-the other way round: their noise is independent, and changes only the length of a step.
+Gauss-Newton on cached paths with instruments, as the square of a path tracer's derivative is mostly
+noise. The instruments Z, on the left, are the derivatives of first-hit light, with little noise:
+with weights W and the difference r of rendered and captured images, Zᵀ W r has mean zero at the
+truth for any Z. On the right are the exact derivatives of full images. Z is of one half of the
+paths, r and the right side of the other, and vice versa, so that their noise is independent and
+only changes the step length.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pictures of kept paths, and how they change with the hair, exactly."""
+"""Images of cached paths, and their exact derivatives by the hair's parameters."""
 
 from __future__ import annotations
 

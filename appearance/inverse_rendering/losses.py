@@ -36,7 +36,7 @@ def level(captured: Array) -> Array:
 def weights(level: Array) -> Array:
     """Weight of a squared difference at a captured `level`, of its shape, in exposure units.
 
-    The squared slope of the sRGB curve, with a floor below which darkness counts no more.
+    The squared derivative of the sRGB curve, bounded by a floor.
     """
     return 0.2 * (level + FLOOR) ** -1.17
 

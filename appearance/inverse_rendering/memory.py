@@ -1,6 +1,6 @@
-"""What memory a fit takes: counted from its sizes before it starts.
+"""Memory of a fit, estimated from its sizes.
 
-Bytes are counted in the code and measured at the peak of whole fits; paths are those of brown hair.
+Bytes are counted in the code and measured at the peak of fits; paths are those of brown hair.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _POINT_BYTES, _BUILDING_BYTES = 225, 375
 _FRAME_BYTES = 25
 """Of a captured pixel under a light."""
 _WHOLE_BYTES, _GUESS_BYTES = 72, 120
-"""Of a pixel under a light where whole pictures are compared, and of each guess there."""
+"""Of a pixel under a light where full images are compared, and of each guess there."""
 _PATH_BYTES = 3000
-"""Of a kept path."""
+"""Of a cached path."""
 _TURN_BYTES, _LIT_BYTES = 96, 30
 """Of a pixel under a light where fibres turn, and there of a path, which three in ten reach."""
 _JUDGED_BYTES, _SHOWN_BYTES = 63, 100

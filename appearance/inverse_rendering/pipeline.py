@@ -49,18 +49,16 @@ def fit_maps(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Fit maps and lights, from the `appearance.json` of Sun's fit, and judge them.
+    """Fit maps and lights, from the `appearance.json` of Sun's fit, and validate them.
 
-    The head is the model's. Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` where
-    images are held out (captured, rendered and error maps) and the stage "inverse_rendering" of
-    the report; a fit that was killed goes on from its checkpoint, which stays in the model until
-    the fit is done, and so do an earlier fit and the field on top of it. If full training images
-    are not clearly better with the result than with Sun's fit, it is discarded with a warning.
-    Returns `{"ended", "error", "start_error", "sure",
-    "accepted", "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim",
-    "relative_error"}}}`, the latter where images are held out; see `Outcome` for errors, of Sun's
-    fit and of the result; "doubts" are warnings if the result is rendered. Raises
-    `CaptureError` or `ModelError` naming what is missing.
+    Writes `hair_maps.npz`, `lights.json`, `inverse_rendering.png` if images are held out (captured,
+    rendered and error maps) and the stage "inverse_rendering" of the report. A killed fit resumes
+    from its checkpoint in the model; an earlier fit and its field stay until the fit is done. If
+    full training images are not clearly better with the result than with Sun's fit, it is
+    discarded with a warning. Returns `{"ended", "error", "start_error", "sure", "accepted",
+    "doubts", "held_out": {"start" | "inverse_rendering": {"psnr", "ssim", "relative_error"}}}`, the
+    last if images are held out; see `Outcome`. "doubts" are warnings if the result is rendered.
+    Raises `CaptureError` or `ModelError` naming what is missing.
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)

@@ -12,7 +12,7 @@ from reconstruction.arrays import AnyFloats, Floats
 from reconstruction.geometry.blocks import block_means
 
 GROUND, INK = "#08090a", "#c3c8cd"
-"""The console's: the pictures are looked at beside the stage, in the dark."""
+"""The console's dark theme."""
 LARGEST = 640
 """Pixels on a side of what a comparison shows, at most."""
 Row = tuple[str, Mapping[str, AnyFloats], Mapping[str, str]]

@@ -133,11 +133,10 @@ def turning_light(
 ) -> Floats:
     """Radiance `(T, N, N, 3)`, N = `size`: `three_quarter_view` while the map turns round once.
 
-    Counter-clockwise seen from above. As light adds up, the model is rendered once under each of
-    `CELLS` panels that tile the sphere, and these pictures are summed for every frame, weighted by
-    the turned map's mean over the panel: a frame more costs next to nothing, and noise does not
-    flicker. A sun is as soft as a panel. Light of the first hit takes `DIRECT` paths a pixel at
-    least, other light is smoothed. Raises `ValueError` without a frame.
+    Counter-clockwise from above. The model is rendered once under each of `CELLS` panels that tile
+    the sphere; a frame is the sum of these images weighted by the turned map's mean over each
+    panel. First-hit light has at least `DIRECT` paths a pixel, indirect light is smoothed. Raises
+    `ValueError` without a frame.
     """
     if frames < 1:
         raise ValueError(f"an animation needs a frame, got {frames}")

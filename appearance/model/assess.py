@@ -299,9 +299,8 @@ def front_lights(
 ) -> list[tuple[int, float]]:
     """Which `lights` to show: indices, and angles in degrees to the camera's direction.
 
-    Directions are seen from the hair's `middle (3,)`. Of the lights less than 90 degrees from the
-    camera, which light what it sees, the one nearest to it; then, `most` in all, the one furthest
-    from those chosen. Where there are none, the one nearest to the camera.
+    Directions are from the hair's `middle (3,)`. First the light nearest to the camera, then, up to
+    `most` and within 90 degrees of the camera, the one furthest from those chosen.
     """
     own = camera.center - middle
     towards = np.array([light.position for light in lights]) - middle

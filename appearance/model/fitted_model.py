@@ -32,13 +32,12 @@ SKIN = 0.5, 0.35, 0.28
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """Strands on a head, the hair's material, skin, exposure, and the lights it was seen under.
+    """Strands on a head, the hair's material, skin, exposure and lights.
 
-    `field` is what the hair reflects beyond that material, None where nothing is known of it.
-    `maps` are of one cell where the hair is one material. `placed (S, 2)` are the roots' places on
-    the scalp's map where they are known; they stay with the strands when they move. `rig` is the
-    capture's, its lights with fitted intensities; `light_rows` are the rows of `lights.json`,
-    empty if they were not fitted.
+    `field` is the reflectance field, if one was fitted. `maps` have one cell for uniform hair.
+    `placed (S, 2)` are the roots on the scalp's map, if known, also of moved strands. `rig` is the
+    capture's with fitted light intensities; `light_rows` are the rows of `lights.json`, empty if
+    lights were not fitted.
     """
 
     strands: Strands

@@ -1,7 +1,4 @@
-"""Captured frames under any light: sums of the answers to single lights. No fit is needed.
-
-Light adds up: a frame under several lights is the sum of the frames under each, by their levels.
-"""
+"""Captured frames under any light, as weighted sums of OLAT frames."""
 
 from __future__ import annotations
 
@@ -18,16 +15,16 @@ from reconstruction.geometry.blocks import block_means
 MEMORY = 1 << 30
 """Bytes that one camera's frames may take; larger ones are reduced by whole factors."""
 _ROWS = 64
-"""Directions from zenith to nadir at least that a map is taken apart into: texels may be large."""
+"""Least number of rows of a map; larger texels are subdivided."""
 _DIM = 1e-3
-"""Of the usual light's irradiance in a colour: dimmer ones are given none of a map."""
+"""Share of the median light's irradiance in a channel below which a light has weight 0."""
 
 
 class LightSums:
-    """A camera's answers to single lights `(L, H, W, 3)`, in memory; `names (L,)` are the lights'.
+    """A camera's OLAT frames `(L, H, W, 3)`, in memory; `names (L,)` are the lights'.
 
-    `reduced` pixels a side of the frames are one of these, their mean, where frames are large.
-    Raises `MissingFrame` where a light's frame is missing.
+    Large frames are averaged over `reduced` × `reduced` pixels. Raises `MissingFrame` if a light
+    has no frame.
     """
 
     def __init__(self, capture: Capture, camera: str, memory: int = MEMORY) -> None:

@@ -19,7 +19,7 @@ from reconstruction.arrays import AnyFloats, Array, Floats
 MARGIN = 1.02
 """Times what long hair fills of a picture."""
 LEAST = 1e-3
-"""Metres about their middle that are seen of strands that all lie in one place."""
+"""Least radius of the view, metres, for strands in one place."""
 PROCEDURAL = {"studio": studio, "sky": sky}
 
 
@@ -46,20 +46,18 @@ def relight(
     radiance = environment_smoothed(scene, camera, envmap, replace(SHOWN, spp=spp, seed=seed))
     share = coverage(scene, camera)
     subject = share["hair"] + share["head"] > 0.5
-    seen = radiance[subject] if subject.any() else radiance  # sparse hair fills no pixel
+    shown = radiance[subject] if subject.any() else radiance  # sparse hair fills no pixel
     with model.writing("relit.exr") as part:
         write_exr(part, radiance)
     with model.writing("relit.png") as part:
-        write_png(part, Exposure.of_picture(seen)(radiance))
+        write_png(part, Exposure.of_picture(shown)(radiance))
     return radiance
 
 
 def three_quarter_view(strands: Strands, size: int, round_deg: float = 0.0) -> Camera:
-    """A camera of `size`² pixels that sees all of `strands` from the front left, slightly above.
+    """A camera of `size`² pixels with all `strands` in view from the front left, slightly above.
 
-    The face looks along −y, as everywhere in this project. `round_deg` is how far the camera has
-    gone round it from there, counter-clockwise seen from above.
-
+    The face looks along −y. `round_deg` rotates the camera about z, counter-clockwise from above.
     Raises `ValueError` without strands.
     """
     if not len(strands):
@@ -78,10 +76,10 @@ def three_quarter_view(strands: Strands, size: int, round_deg: float = 0.0) -> C
 
 
 def _half_angle(strands: Strands, middle: Array, distance: float, direction: Array) -> float:
-    """Half of the angle, radians, that `strands` fill seen from so far and high, all around."""
+    """Half of the largest angle, radians, that `strands` subtend on a turn of the camera."""
     x, y, up = (strands.points.astype(float) - middle).T
     out, level, rise = np.hypot(x, y), float(np.hypot(*direction[:2])), direction[2]
-    # how far to a side, above and below the middle of the picture a point comes as it goes round
+    # largest offsets of a point to the side, above and below the image's centre during a turn
     beside = out / np.sqrt((distance - up * rise) ** 2 - (out * level) ** 2)
     above = [
         np.abs(up * level - near * rise) / (distance - up * rise - near * level)

@@ -1,10 +1,9 @@
-"""Camera paths that are kept: evaluated again for other hair, they cost no ray.
+"""Cached camera paths, evaluated again for other hair without tracing a ray.
 
-A picture is a mean over paths of products of the BSDF, one factor a vertex, over the density that
-its direction was drawn with. Kept are, for each vertex, where on which strand it lies and the
-directions in the fibre's frame; for each light that reached it, from where and how much. For one
-set of paths the picture is a smooth function of the hair, whose derivatives are exact; the further
-the hair is from the one that the paths were drawn with, the noisier it is.
+An image is a mean over paths of products of BSDF values over sampling densities. Cached are each
+vertex's place on its strand and its directions in the fibre's frame, and the direction and radiance
+of each light that reached it. For one set of paths the image is a smooth function of the hair with
+exact derivatives; its noise grows with the distance to the hair that the paths were sampled with.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.options import Count, options
 
 _ROULETTE = 0.3
-"""Throughput below which a path goes on only with probability in proportion."""
+"""Throughput below which a path survives with probability in proportion."""
 _ROOM = 6
-"""Lights that reach a vertex, for which there is room at first."""
+"""Lights per vertex for which buffers are allocated at first."""
 _STREAM, _LIGHT_STREAM = 100, 200
 _TINY = 1e-20
 
@@ -40,8 +39,8 @@ _TINY = 1e-20
 class CachedSampling:
     """`spp` paths a pixel of at most `max_depth` vertices.
 
-    A light that would bring a path less than `dim`, in units of the importance that pixels have,
-    casts its shadow ray only with probability in proportion, and then counts for more.
+    A light with a contribution below `dim`, in units of the pixels' importance, casts its shadow
+    ray with probability in proportion (Russian roulette).
     """
 
     spp: Count = 8
@@ -51,8 +50,7 @@ class CachedSampling:
 
 @dataclass(frozen=True, eq=False)
 class WeightedPixels:
-    """Flat pixel indices `index (P,)` and, under each light, what a pixel's radiance counts for
-    beside others': `importance (L, P)`."""
+    """Flat pixel indices `index (P,)` and their weights under each light, `importance (L, P)`."""
 
     index: Ints
     importance: Floats

@@ -1,8 +1,7 @@
-"""Pictures under an environment map: lat-long radiance all around the subject.
+"""Images under an environment map: lat-long radiance around the subject.
 
-Orientation: row 0 of a map `(h, w, 3)` is the zenith (+z), the last row the nadir; the middle
-column looks along +x and columns to its right turn clockwise seen from above (towards −y), so that
-a map is upright and not mirrored when seen from inside. Blender's equirectangular convention.
+Blender's equirectangular convention: row 0 of a map `(h, w, 3)` is the zenith (+z), the last row
+the nadir; the middle column is +x, and columns to its right turn clockwise from above (towards −y).
 """
 
 from __future__ import annotations
@@ -55,10 +54,9 @@ def render_environment(
 ) -> Floats:
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
 
-    `rotation_deg` turns the map counter-clockwise seen from above. Pixels off the subject are 0,
-    or the map with `background`. Each vertex of a path samples one direction, in proportion to the
-    map's brightness. Raises `ValueError` for maps that are negative or not finite,
-    `FloatingPointError` where light is not finite.
+    `rotation_deg` turns the map counter-clockwise from above. Pixels off the subject are 0, or the
+    map with `background`. Each vertex samples one direction in proportion to the map's brightness.
+    Raises `ValueError` for negative or infinite maps, `FloatingPointError` for infinite light.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -89,9 +87,8 @@ def direct_environment(
 ) -> Floats:
     """`render_environment` to the first hit alone `(H, W, 3)`, its directions well spread.
 
-    A pixel's samples ask directions that follow each other by the golden ratio on a curve through
-    the map (`_along_curve`), from a random one: on smooth surfaces under half the noise of
-    independent ones.
+    A pixel's directions are a golden-ratio sequence on a curve through the map (`_along_curve`):
+    under half the noise of independent ones on smooth surfaces.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -163,7 +160,7 @@ class Sky:
 
     @classmethod
     def of(cls, envmap: Floats, rotation_deg: float) -> Sky:
-        """The sky of `envmap (h, w, 3)`, turned counter-clockwise seen from above.
+        """The sky of `envmap (h, w, 3)`, turned counter-clockwise from above.
 
         Raises `ValueError` for a turn that is not finite.
         """

@@ -61,10 +61,10 @@ def harmonics(directions: ArrayLike, degree: int) -> Floats:
 
 
 def turns(frames: ArrayLike, degree: int) -> list[Floats]:
-    """What frames do to harmonics: for each degree k from 1 a block `(H, 2k + 1, 2k + 1)`.
+    """Rotations of harmonics by frames: for each degree k from 1 a block `(H, 2k + 1, 2k + 1)`.
 
-    `frames (H, 3, 3)` have their axes as columns. The harmonics of a direction seen in a frame,
-    Y(Fᵀω), are the block times those in the world, Y(ω).
+    `frames (H, 3, 3)` have their axes as columns. The harmonics in a frame, Y(Fᵀω), are the block
+    times those in the world, Y(ω).
     """
     directions, inverse = _probes(degree)
     local = harmonics(np.einsum("qi,hij->hqj", directions, np.asarray(frames, float)), degree)

@@ -100,11 +100,10 @@ def render_indirect(
     seed: int = 0,
     **options: Any,
 ) -> Floats:
-    """What `render_olat` sees of light that has met more than one surface: `(L, P, 3)`.
+    """Indirect light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    It is the material's alone, without the scene's field. Fibres behind the first answer by the
-    mean over half of their width, where a ray may meet them anywhere: half of the variance on hair
-    that is the same everywhere. Other hair answers as it does in `render_olat`.
+    Fibres behind the first have the BSDF's mean over half of their width, which halves the variance
+    on uniform hair. Other hair has the BSDF of `render_olat`.
     """
     view = _View(scene, camera, lights, pixel_indices(camera, pixels))
     return _rendered(view, OlatOptions(**options), seed, indirect=True)
@@ -214,7 +213,7 @@ def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan
 class _Gather:
     """Light from the bank, or a systematic sample of it, at a path's vertex.
 
-    Where `indirect`, first vertices ask none.
+    If `indirect`, first vertices gather none.
     """
 
     surface: Surface

@@ -21,15 +21,15 @@ from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 class PixelField:
     """Spherical harmonics of the direction to a light in the world, for each of P pixels.
 
-    `coefficients (P, n, 3)`; with a = Y(ω) · coefficients, what a light sends by way of a pixel is
+    `coefficients (P, n, 3)`; with a = Y(ω) · coefficients, a light's contribution to a pixel is
 
-    - modulation: the path tracer's contribution times max(0, 1 + a), sample by sample
-    - `additive`: the contribution plus a times the light's irradiance at the pixel's point; where
-      `alone`, that without the path tracer's
+    - modulation: the path tracer's times max(0, 1 + a), sample by sample
+    - `additive`: the path tracer's plus a times the light's irradiance at the pixel's point;
+      without the path tracer's if `alone`
 
-    `points (P, 3)` in metres are what near lights are seen from. Pixels off the hair have
-    coefficients of 0. Coefficients `(P, n, 3 · F)` are those of F fields, each channel's side by
-    side; `lit` shows all of them.
+    `points (P, 3)` in metres are the origins of directions to lights. Pixels off the hair have
+    coefficients of 0. Coefficients `(P, n, 3 · F)` are those of F fields, by channel; `lit` returns
+    all of them.
     """
 
     coefficients: Floats

@@ -62,12 +62,10 @@ def render_scanlines(
     """Radiance of each row of each projector at full level, W/(sr m²).
 
     Returns by projector name `(rows, H, W, 3)`, or `(rows, P, 3)` for `pixels (P,)` (flat
-    indices). Every vertex of a camera path that a projector sees lies on one fractional row of it:
-    its light goes to the few rows within reach of the line's blur (`Projector.row_weight`), so one
-    pass answers the whole sweep. The sum over all rows is that projector with all rows on.
-    `rows` limits a projector to a range of its rows; `options` are as in `ScanlineOptions`. A
-    moved subject is rendered with the camera and the projectors `moved` instead: the scene stays as
-    it is.
+    indices). A path vertex projects to one fractional row, and its light is distributed over the
+    rows within the line's blur (`Projector.row_weight`), so one pass renders the sweep. The sum
+    over rows is the projector with all rows on. `rows` limits a projector to a range; `options`: see
+    `ScanlineOptions`. For a moved subject, give the camera and projectors `moved` inversely.
     """
     sweep = _sweep(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)

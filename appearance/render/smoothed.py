@@ -28,16 +28,15 @@ from reconstruction import Camera, Light
 from reconstruction.arrays import AnyFloats, Floats
 
 SIGMA = 1.25
-"""Pixels that indirect light is averaged over."""
+"""Standard deviation, pixels, of the filter of indirect light."""
 _WIDE = 4.0
-"""Times as far that the light of rare bright paths is spread."""
+"""Factor on it for the light of rare bright paths."""
 _RARE = 2.0
-"""Times the mean over the wide window from which on light counts as a rare path's."""
+"""Multiple of the mean over the wide window above which light is that of a rare path."""
 _AT_A_TIME = 16
-"""Lights whose whole pictures are in memory at once."""
+"""Lights whose full images are in memory at once."""
 DIRECT = 64
-"""Paths a pixel of direct light at least. On one grid over the pixel their error falls by 3 dB and
-more with twice as many, and each takes a quarter of the time of a path of all light."""
+"""Least number of paths a pixel of direct light, each a quarter of the cost of a full path."""
 _DIRECT_OF_MAPS = 12
 SHOWN = Sampling(36, 16)
 
@@ -52,9 +51,8 @@ def olat_smoothed(
 ) -> Floats:
     """`render_olat` with its indirect light smoothed over `SIGMA` pixels.
 
-    Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`: that saves memory, not time,
-    as smoothing needs all that see the subject. `sampling.spp` paths a pixel bring all light, as
-    many again, and `DIRECT` at least, direct light only.
+    Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`, which saves memory, not time.
+    `sampling.spp` paths a pixel are of all light, and as many, at least `DIRECT`, of direct light.
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     share = coverage(scene, camera, max(spp, 16), seed)

@@ -22,17 +22,16 @@ from reconstruction.options import Count, options
 _log = logging.getLogger(__name__)
 
 LANE_BYTES = 512
-"""What a path in flight takes, about."""
+"""Approximate memory of a path."""
 
 
 @options
 class PathLimits:
-    """How far paths go.
+    """Limits of a path.
 
-    `max_depth`: vertices a path may have. `roulette`: throughput (largest channel) below which a
-    path goes on only with probability throughput/`roulette`, and then counts as that much. 0 ends
-    no path before it leaves or reaches `max_depth`. On blond and on black hair 0.5 costs least to
-    the same error; 0.3 to 1 is within a sixth of it.
+    `max_depth`: most vertices. `roulette`: throughput (largest channel) below which a path
+    survives with probability throughput/`roulette`; 0 disables it. On blond and on black hair 0.5
+    costs least for the same error; 0.3 to 1 is within a sixth of it.
     """
 
     max_depth: Count
@@ -183,11 +182,10 @@ def render_again(
     again: Callable[[Ints], None],
     seed: int,
 ) -> None:
-    """Render those of the flat pixels `index (P,)` once more whose light is not finite.
+    """Render the pixels of `index (P,)` once more whose light is not finite, a rare float error.
 
-    Seen twice in hundreds of renders, in a pixel or two, and never again with the same numbers.
-    `finite` says of each whether it is, `again` renders those at some places of `index` anew.
-    Raises `FloatingPointError` where light stays so.
+    `finite` returns a flag per pixel, `again` renders those at some places of `index`. Raises
+    `FloatingPointError` if light stays infinite.
     """
     bad = np.flatnonzero(~finite())
     if not len(bad):
@@ -196,4 +194,4 @@ def render_again(
     _log.warning("%s, seed %d; they are rendered again", where, seed)
     again(bad)
     if not finite().all():
-        raise FloatingPointError(f"{where}, twice: look at the strands and lights there")
+        raise FloatingPointError(f"{where}, twice: check the strands and lights there")

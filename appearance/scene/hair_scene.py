@@ -38,13 +38,12 @@ class SceneField(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class HairScene:
-    """Geometry with its acceleration structure, and the materials that renderers put on it.
+    """Geometry with its acceleration structure, and materials.
 
     `mi_scene` is a `mitsuba.Scene` without emitters or sensors, in centimetres. `hair_bsdf` is a
-    `mitsuba.BSDF`, or None for `DiffuseHair`. The materials are not looked up through the scene's
-    shapes, so `with_hair` and `with_skin` share the geometry and cost nothing. `field` is what the
-    hair sends beyond its material: `render_olat`, `render_environment`, `render_mixed` and the
-    smoothed pictures show it, gradients and scanlines do not.
+    `mitsuba.BSDF`, or None for `DiffuseHair`. `with_hair` and `with_skin` share the geometry.
+    `field` is a reflectance field, used by `render_olat`, `render_environment`, `render_mixed` and
+    the smoothed images, not by gradients and scanlines.
     """
 
     mi_scene: Any
@@ -58,9 +57,9 @@ class HairScene:
     def occluded(self, ray: Any, active: Any = True) -> Any:
         """Whether `ray` meets anything before its end.
 
-        OptiX answers Mitsuba's `ray_test` by a coarser intersector (NVIDIA's forum, topic 269395),
-        by which a ray that passes through the fibre it starts on may meet that fibre's far side:
-        hair lit from behind is 15 to 18 % too dark. On a GPU the nearest hit is computed instead.
+        OptiX implements Mitsuba's `ray_test` by a coarser intersector (NVIDIA's forum, topic
+        269395), by which a ray through the fibre it starts on may hit that fibre's far side: hair
+        lit from behind is 15 to 18 % too dark. On a GPU the nearest hit is computed instead.
         """
         if str(mi.variant()).startswith("cuda"):
             return self.mi_scene.ray_intersect_preliminary(ray, False, active).is_valid()
@@ -157,9 +156,9 @@ def _curves(strands: Strands) -> Any:
 def _guarded(points: Array, segments: Ints) -> tuple[Array, Ints]:
     """The curves and copies of their last segment, thin inside it, where no ray meets them.
 
-    Mitsuba finds a hit's segment back from one float32 coordinate over all segments. Rounding
-    takes a hit near the end of the last one past the end of its array (seen at a million segments:
-    a read out of bounds); it now finds the copy, which has the same axis.
+    Mitsuba derives a hit's segment from one float32 coordinate over all segments. Rounding takes a
+    hit near the end of the last one past the end of its array (a read out of bounds at a million
+    segments); with copies it is the copy, which has the same axis.
     """
     copies = 1 + int(np.ceil(len(segments) * np.finfo(np.float32).eps))
     last = points[segments[-1] : segments[-1] + 4] * (1, 1, 1, 1e-3)

@@ -1,14 +1,14 @@
 """Roughness from highlights, by strands whose tangents are not exact.
 
-An error ε of a tangent's inclination moves the pixel's whole highlight by 2ε, so the mean profile
-over many pixels is wider than the lobe and its roughness too large. The product of a pixel's
-responses to two lights near its mirror direction, averaged over the angle Δ between them, does not
-depend on where the highlight is: its width over Δ is the lobe's. For broad lobes, where Δ does not
-reach far enough, the profile decides, with the spread of its shifts as an unknown. Renderings of
-known roughness are measured in the same way; the roughness is the one whose renderings match.
+An error ε of a tangent's inclination shifts the pixel's highlight by 2ε, so the mean profile over
+pixels is wider than the lobe. The product of a pixel's responses to two lights near its mirror
+direction, averaged over the angle Δ between them, is independent of the highlight's position: its
+width over Δ is the lobe's. Broad lobes exceed the range of Δ; there the profile decides, with the
+spread of its shifts as an unknown. Renderings of known roughness are measured in the same way; the
+result is the roughness whose renderings match.
 
-Reconstructed strands may be smoother than hair. A pixel of theirs then mixes fewer directions, and
-the roughness that matches is larger than that of the fibres.
+Reconstructed strands may be smoother than hair; then the roughness that matches is larger than that
+of the fibres.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _STEPS = 400
 
 @dataclass(frozen=True)
 class Roughness:
-    """The roughness to render strands with, and its error.
+    """Roughness and its error.
 
     `error` is the standard error of log β_M: the larger of those over parts of the hair (`parts`)
     and between views. `low`, `high` are the ends of an interval of about 95 %, inside `range`, that
@@ -59,7 +59,7 @@ class Roughness:
         return self.low <= self.range[0] * 1.001, self.high >= self.range[1] / 1.001
 
     def limit(self) -> str:
-        """What the estimate means on strands that were reconstructed, one sentence."""
+        """The estimate's limit on reconstructed strands, one sentence."""
         return (
             "Fibres inside a pixel vary more than the reconstructed strands: "
             f"beta_m {self.beta_m:.2g} (95 % interval {self.low:.2g}–{self.high:.2g}) is the "
@@ -68,7 +68,7 @@ class Roughness:
         )
 
     def warnings(self) -> list[str]:
-        """What makes the estimate uncertain, one sentence each."""
+        """Reasons of uncertainty, one sentence each."""
         interval = f"95 % interval {self.low:.2g}–{self.high:.2g}"
         (least, most), out = self.range, []
         if any(self.ends()):
@@ -93,9 +93,9 @@ def match_roughness(captured: Highlight, rendered: Sequence[tuple[float, Highlig
     """The β_M whose rendered highlights are nearest the `captured` one.
 
     Between the `rendered` roughnesses, which ascend, each bin is interpolated monotonically in log
-    β_M. Bins weigh by their scatter over parts of the hair; the error of the answer is the
-    jackknife's over the same parts, or what the views' answers differ by where that is more. Raises
-    `ValueError` where there are too few pairs of lights.
+    β_M. Bins are weighted by their scatter over parts of the hair; the error is the larger of the
+    jackknife's over the same parts and the views' spread. Raises `ValueError` for too few pairs of
+    lights.
     """
     if (pairs := int(captured.pairs.sum())) < FEWEST_PAIRS:
         raise ValueError(
