@@ -24,21 +24,20 @@ ValidationSet = Sequence[tuple[Patch, Array]]
 """Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
 
 _DIRECT_PATHS, _FEWEST, _MOST = 400_000, 4, 16
-"""Kept paths of one vertex of all views together, and a pixel."""
+"""Cached one-vertex paths of all views, and fewest and most per pixel."""
 _ALL = 1e-9
-"""A light so dim casts its shadow ray: which do must not depend on the hair."""
+"""Dimmest light that casts shadow rays, so low that the choice does not depend on the hair."""
 _LEAST_SPP = 16
-"""Of indirect light, whose noise is no less for small pictures."""
+"""Least paths a pixel of indirect light."""
 _WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
-"""Paths of whole pictures of all views together, and of a pixel at least: one or two of them, and
-noise decides what is better. And parts of a view's hair, about."""
+"""Paths of full images of all views, least paths a pixel, and about how many parts of the hair."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
-"""Lights that a path samples at its first vertex and at later ones, for means over lights."""
+"""Lights sampled at a path's first and later vertices, for means over lights."""
 
 
 @dataclass(frozen=True, eq=False)
 class DirectLight:
-    """Kept paths of one vertex through a `patch`: its direct light, for any maps on its strands.
+    """Cached one-vertex paths of a `patch`: its direct light for any maps.
 
     `intensities (L, 3)` of the patch's lights are in scene units, times the exposure.
     """
@@ -54,7 +53,7 @@ class DirectLight:
 
 
 def direct_spp(pixels: int) -> int:
-    """Kept paths of one vertex a pixel, where all views together have so many `pixels`."""
+    """Cached one-vertex paths a pixel, for views of so many `pixels` in total."""
     return int(np.clip(_DIRECT_PATHS // max(pixels, 1), _FEWEST, _MOST))
 
 

@@ -64,8 +64,8 @@ def render_scanlines(
     Returns by projector name `(rows, H, W, 3)`, or `(rows, P, 3)` for `pixels (P,)` (flat
     indices). A path vertex projects to one fractional row, and its light is distributed over the
     rows within the line's blur (`Projector.row_weight`), so one pass renders the sweep. The sum
-    over rows is the projector with all rows on. `rows` limits a projector to a range; `options`: see
-    `ScanlineOptions`. For a moved subject, give the camera and projectors `moved` inversely.
+    over rows is the projector with all rows on. `rows` limits a projector to a range. `options`:
+    see `ScanlineOptions`. For a moved subject, give the camera and projectors `moved` inversely.
     """
     sweep = _sweep(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
