@@ -1,4 +1,4 @@
-"""Ways to say how much a fibre absorbs: pigments, or the colour that dense hair should show.
+"""A fibre's absorption from pigments, or from the colour of dense hair.
 
 Both work on Dr.Jit arrays and are differentiable; `appearance.bsdf.longitudinal` has the
 second in NumPy, with its inverse.

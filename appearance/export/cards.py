@@ -1,9 +1,8 @@
-"""glTF: hair cards for engines, ribbons with a texture of the strands that they stand for.
+"""glTF: hair cards for engines, ribbons with a texture of the strands of a clump.
 
-Strands are put into clumps; a card runs along the clump's mean and is as wide as the clump, its
-flat side away from the head. The clump's strands are drawn on it, each card in a tile of its own.
-Three levels of detail are nodes of their own, tied by MSFT_lod, each with a quarter of the cards of
-the one before. glTF is y up, in metres; the face looks along +z.
+A card follows the clump's mean, as wide as the clump and facing away from the head; each has a tile
+of the texture. Three levels of detail (MSFT_lod) have a quarter of the cards of the one before.
+glTF is y up, in metres; the face looks along +z.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ TILE = (32, 256)
 ROW = 64
 """Tiles in a row of the texture."""
 WIDE = 2.0
-"""Standard deviations of a clump that its card reaches to either side."""
+"""Half width of a card, in standard deviations of its clump."""
 STRAIGHT = 1e-3
-"""Sine of the angle to the way off the head below which a card has no side of its own."""
+"""Sine of the angle to the head's normal below which a card's side is undetermined."""
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 

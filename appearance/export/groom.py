@@ -1,4 +1,4 @@
-"""What every export is made of: strands with a value for each point and strand, head, material."""
+"""Input of all exports: strands with values per point and strand, head, material."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SHAPE = 8
 
 @dataclass(frozen=True, eq=False)
 class Groom:
-    """Strands as they go out.
+    """Exported strands.
 
-    `root_uv (S, 2)` are the roots' places on the scalp's map; `ids (S,)` the strands' places in the
-    model's `strands.npz`. `confidence (N,)` in [0, 1] is the strands' own, or else says how near
-    a point is to a triangulated one (Gaussian of `MEASURED`), None without both. `guides (G,)` are
-    the strands that stand for clumps, `clump (S,)` which of them each strand follows; both empty
-    without guides. `head_uv (V, 2)` is the map at the head's vertices, NaN off the scalp, or None.
+    `root_uv (S, 2)` are the roots on the scalp's map; `ids (S,)` the strands' indices in
+    `strands.npz`. `confidence (N,)` in [0, 1] is the strands' own, else a Gaussian (`MEASURED`) of
+    the distance to a triangulated point, None without both. `guides (G,)` are guide strands, `clump
+    (S,)` each strand's guide; both empty without guides. `head_uv (V, 2)` is the map at the head's
+    vertices, NaN off the scalp, or None.
     """
 
     strands: Strands
@@ -51,10 +51,10 @@ class Groom:
     def load(
         cls, model: Model, capture: Capture | None = None, options: ExportOptions | None = None
     ) -> Groom:
-        """The groom of a model, with what its points and its scalp's map say of it.
+        """The groom of a model; `capture` gives the head if the model has none.
 
-        `capture` gives the head if the model has none. A model that was never fitted gets the usual
-        brown (`FittedModel.unfitted`). Raises `ModelError` naming what is missing.
+        A model without a fit is brown (`FittedModel.unfitted`). Raises `ModelError` naming what is
+        missing.
         """
         made = FittedModel.load if model.has("appearance.json") else FittedModel.unfitted
         fitted = made(model, capture)
@@ -122,8 +122,7 @@ def upwards(uv: Array) -> Floats:
 def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, Ints]:
     """`count` of the strands, drawn at random, and their indices `(count,)`, in order.
 
-    The radius grows by the total length over the length that is left: the area that strands cover
-    where they do not hide each other stays.
+    The radius is multiplied by the ratio of total lengths, which keeps the covered area.
     """
     if count is None or count >= len(strands):
         return strands, np.arange(len(strands))

@@ -1,8 +1,7 @@
-"""A scene for stock Mitsuba 3, which needs nothing of ours.
+"""A scene for stock Mitsuba 3.
 
-Its `hair` has one colour a shape: the segments of all strands are sorted into shapes of like
-colour, which changes no curve, since a piece of a spline keeps its own control points. What is lost
-are differences within a shape and the correctives.
+Its `hair` has one colour a shape: segments are grouped into shapes of similar colour, which keep
+their control points. Differences within a shape and correctives are lost.
 """
 
 from __future__ import annotations

@@ -11,13 +11,12 @@ from reconstruction.options import Count, options
 
 @options
 class ExportOptions:
-    """What becomes of the strands on their way out.
+    """Options of an export.
 
-    `strands`: so many of them, drawn at random, their radius larger by as much as the length lost,
-    which keeps the area that they cover; all where None or where there are fewer. `guides`: strands
-    that stand for clumps of the others, 0 for none. `cards`: ribbons of the finest level of glTF;
-    each further level has a quarter of them. The most make a texture of 16,384 pixels, what
-    graphics cards take.
+    `strands`: number of random strands, with radii that keep the covered area; all if None.
+    `guides`: number of guide strands. `cards`: ribbons of the finest level of glTF; each further
+    level has a quarter of them. The most make a texture of 16,384 pixels, the limit of graphics
+    cards.
     """
 
     strands: Count | None = None

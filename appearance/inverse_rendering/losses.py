@@ -24,10 +24,9 @@ GroomLight's 10 forbids the turns that undo a bend of 5°."""
 
 
 def level(captured: Array) -> Array:
-    """Mean of each captured pixel's neighbours in image order `(L, P, 3)`, to make weights of.
+    """Mean of the two neighbours on either side in image order `(L, P, 3)`, for weights.
 
-    Of the two on either side, without the pixel itself: a weight would be largest where noise made
-    it dark, and a fit darker than the truth the better one.
+    Without the pixel itself, whose noise would bias its weight and the fit.
     """
     values = np.maximum(captured, 0)
     return np.asarray(correlate1d(values, [0.25, 0.25, 0, 0.25, 0.25], axis=1, mode="mirror"))
@@ -42,12 +41,10 @@ def weights(level: Array) -> Array:
 
 
 def noise_weighted(weight: Array, squares: Array) -> Array:
-    """`weight (L, P, 3)`, less of it where pictures are noisy: one pixel in a hundred has two
-    fifths of all noise.
+    """`weight (L, P, 3)`, reduced in noisy pixels: one in a hundred has two fifths of all noise.
 
-    `squares` are those of differences of independent pictures. They are averaged over channels and
-    five pixels in image order; a pixel of the median noise keeps half of its weight, all together
-    keep theirs. The weights do not depend on what is judged, if the squares do not.
+    `squares` are those of differences of independent images, averaged over channels and five pixels
+    in image order; a pixel of the median noise keeps half of its weight, and the sum is kept.
     """
     noise = correlate1d(squares.mean(axis=-1), np.full(5, 0.2), axis=1, mode="mirror")[..., None]
     relative = weight * noise

@@ -1,4 +1,4 @@
-"""A fit's data, and how far a guess is off."""
+"""A fit's data, and the error of a guess."""
 
 from __future__ import annotations
 

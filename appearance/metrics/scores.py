@@ -1,8 +1,7 @@
-"""How well a rendered picture agrees with a captured one, on the hair alone.
+"""Scores of rendered against captured images, on the hair.
 
-Radiance becomes a picture by one exposure for the whole capture (`Exposure`) and the sRGB curve.
-PSNR and SSIM compare such pictures, and LPIPS where the user supplies its weights; the relative
-error compares radiance.
+PSNR, SSIM and, if the user supplies its weights, LPIPS compare images displayed with one exposure
+for the capture (`Exposure`) and the sRGB curve; the relative error compares radiance.
 """
 
 from __future__ import annotations
@@ -89,9 +88,8 @@ def ssim(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float
 def ssim_map(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> Array:
     """Structural similarity `(H, W, C)` (Wang 2004): 11×11 Gaussian of σ 1.5, range 1.
 
-    A window's statistics are taken over its pixels in the mask, with the weights rescaled to sum
-    to 1: what lies beside the hair neither helps nor hurts, and a method earns nothing with a black
-    background. Inside the mask it is the usual SSIM; outside it is 0.
+    A window's statistics are over its pixels in the mask, with weights rescaled to sum to 1, so
+    that the background has no effect. 0 outside the mask.
     """
     image, truth, mask = _checked(image, truth, mask)
     weight = _blur(mask.astype(float))

@@ -1,4 +1,4 @@
-"""Moving pictures of a fitted model: a turntable, light that turns, or hair that moves."""
+"""Animations of a fitted model: a turntable, turning light, or moving hair."""
 
 from __future__ import annotations
 
@@ -32,25 +32,24 @@ from reconstruction.files.durable import writing
 SECONDS = 3.0
 """Of a turn, or a sway."""
 _LAG = 1.5
-"""Radians that a tip is behind its root in a sway."""
+"""Phase of a tip behind its root in a sway, radians."""
 _ACROSS = 12.0
-"""Radians a metre that roots are behind each other."""
+"""Phase between roots, radians per metre."""
 CELLS = 10, 24
-"""Rows and columns of the panels that a turning map becomes."""
+"""Rows and columns of a turning map's panels."""
 _FAR = 100.0
 """Metres to these panels."""
 _ASKED = {"first_lights": 24, "deep_lights": 16}
-"""Panels that a path's first and later vertices weigh."""
+"""Panels sampled at a path's first and later vertices."""
 _PIXELS = 10_000
-"""Pixels whose pictures under every panel are in memory at once."""
+"""Pixels in memory at once, under every panel."""
 
 
 def sway(strands: Strands, frames: int, degrees: float) -> list[Strands]:
-    """The poses of hair that swings from side to side once: the last goes over into the first.
+    """A periodic sequence of poses of hair that swings from side to side.
 
-    Each segment is turned about the direction of sight (y), the more the nearer the tip, up to
-    `degrees`; lengths stay. Nothing keeps strands out of the head. Raises `ValueError` for fewer
-    than two frames, or degrees beyond 0 to 45.
+    Each segment is rotated about y, by up to `degrees` at the tip; lengths stay. Strands may enter
+    the head. Raises `ValueError` for fewer than two frames, or degrees beyond 0 to 45.
     """
     if frames < 2:
         raise ValueError(f"a sway needs at least 2 frames, got {frames}")
@@ -85,8 +84,8 @@ def moving(
 ) -> Floats:
     """Radiance `(T, H, W, 3)` of the model in each of `poses`, under the same lights and maps.
 
-    Its field moves with the strands. All frames have the same random numbers, so that what does not
-    move does not flicker. Raises `ValueError` for poses of another topology.
+    Its field moves with the strands. All frames have the same random numbers, against flicker.
+    Raises `ValueError` for poses of another topology.
     """
     out, maps = [], [x.shown() for x in lit[1]]
     for k, pose in enumerate(poses):
@@ -108,9 +107,8 @@ def turntable(
     sampling: Sampling,
     progress: Progress = silent,
 ) -> Floats:
-    """Radiance `(T, N, N, 3)`, N = `size`: the model turns once before the camera, and the room
-    with its map once the other way. Raises `ValueError` without a frame.
-    """
+    """Radiance `(T, N, N, 3)`, N = `size`: the model turns once before the camera, and the room's
+    map once the other way. Raises `ValueError` without a frame."""
     if frames < 1:
         raise ValueError(f"a turntable needs a frame, got {frames}")
     scene, envmap, out = fitted.scene(), room.shown(), []

@@ -1,4 +1,4 @@
-"""Rendered against captured: held-out lights, a held-out camera, beside trivial baselines."""
+"""Rendered and baseline images compared with held-out lights and a held-out camera."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silen
 from reconstruction.arrays import AnyFloats, Array, Bools
 
 FITS = ("ours", "sun_fit", "inverse_rendering", "without_field", "guided_frames")
-"""Names in the results that are no baselines."""
+"""Methods in the results that are not baselines."""
 OWN_FRAMES = "three_nearest_own_frames"
-"""What has the held-out camera's own frames, which nothing else has: beaten or not, no warning."""
+"""A reference with the held-out camera's own frames, without a warning."""
 INTERPOLATED = {
     "three_nearest": "three nearest lights",
     "nearest_cameras": "three nearest cameras",
@@ -72,33 +72,26 @@ def assess(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Compare a fitted model with the frames it was not fitted to, and relight it.
+    """Compare a fitted model with held-out frames, and relight it.
 
-    The model is judged as `FittedModel` renders it: with hair maps and lights as found where there
-    are any. Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}},
-    "held_out_camera": …}`, means over images, each over the captured hair mask. The methods are
-    "ours"; if that is inverse rendering, also "sun_fit" and "inverse_rendering" by themselves
-    ("rendered", beside the groups, names the fit of the material);
-    where a field is on Sun's fit, that "without_field"; and the baselines
+    Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}}, "held_out_camera":
+    …}`, means over images, each over the captured hair mask; a group with nothing held out is left
+    out. "rendered" names the fit of the material, "lpips" the reason if that score is missing. The
+    methods are "ours", the parts of it ("sun_fit", "inverse_rendering", "without_field"), and
 
-    - "guided_frames", of held-out lights, no baseline: frames changed as our model says, see
-      `GuidedFrames`
-    - "mean_colour": one colour, the mean over training frames and hair pixels
+    - "guided_frames", of held-out lights: see `GuidedFrames`
+    - "mean_colour": the mean over training frames and hair pixels
     - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
-    - "three_nearest", of held-out lights: the camera's own frames under the three nearest training
+    - "three_nearest", of held-out lights: the camera's frames under the three nearest training
       lights, interpolated
     - "nearest_cameras", of a held-out camera: other cameras' frames projected on our geometry, see
-      `NearestCameras`; left out where there is no other camera, or one of them meets no strand
+      `NearestCameras`; left out without another camera, or if one meets no strand
     - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
       under the three nearest other training lights
 
-    A group with nothing held out is left out. "lpips" is a score like the others where its weights
-    are given (`appearance.metrics.lpips`), and a reason beside the groups where not.
-
-    Writes `comparison.png` where there is something to compare (lights: `front_lights`),
-    `relit.png` and `relit.exr` (see `relight`), `relit.webp` if `options.turning_frames` is above 0
-    for it (see `turning_light`), and the stage "images" of the report, which warns of
-    every baseline that is not beaten.
+    Writes `comparison.png`, `relit.png` and `relit.exr` (see `relight`), `relit.webp` if
+    `options.turning_frames` is above 0 (see `turning_light`), and the stage "images" of the report,
+    which warns of every baseline that is not beaten.
     """
     options = options or AssessOptions()
     envmap = environment_map(environment)
@@ -130,7 +123,7 @@ def assess(
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """What is compared with what."""
+    """The data of a comparison."""
 
     capture: Capture
     training: Capture
@@ -326,7 +319,7 @@ def _scores(images: Sequence[_Compared], method: str, exposure: Exposure) -> dic
 
 
 def judge(result: Mapping[str, Any], stage: Stage) -> None:
-    """Warn of every baseline that is not beaten, but for the one that has the camera's frames."""
+    """Warn of every baseline that is not beaten, except `OWN_FRAMES`."""
     for group, rows in result.items():
         for baseline in rows:
             if baseline in FITS or baseline == OWN_FRAMES:

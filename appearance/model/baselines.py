@@ -1,4 +1,4 @@
-"""Pictures made of captured frames alone: what a fit has to beat."""
+"""Baseline images made of captured frames only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from appearance.scene.hair_scene import SCALE, HairScene
 from reconstruction import Camera, Capture, Light
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
-SATURATED = 1e-3  # the weight of what is saturated: it counts where all is
+SATURATED = 1e-3  # weight of saturated values, decisive only if all are
 CAMERAS = 3
 """Nearest cameras, and nearest lights, that are interpolated."""
 
@@ -27,10 +27,9 @@ def three_nearest(
 ) -> AnyFloats:
     """`camera`'s frames `(H, W, 3)` under the three `training` lights nearest to `light`, mixed.
 
-    Weights go with the inverse angle about the head; each frame is scaled by intensity over squared
-    distance to what `light` would give. `light` itself is never among the three, nor is one that
-    sends nothing to the head. A pixel that is saturated in some of them is mixed of the others, a
-    colour of those that have it. Raises `ValueError` where there is no such frame.
+    Weights are inverse angles about the head; each frame is scaled by the ratio of irradiances.
+    `light` itself and dark lights are excluded, and saturated values or missing channels if others
+    have them. Raises `ValueError` without such a frame.
     """
     names = other_lights(capture, camera, light, training)
     if not names:
@@ -63,13 +62,12 @@ def other_lights(capture: Capture, camera: str, light: Light, training: Sequence
 
 @dataclass(frozen=True, eq=False)
 class NearestCameras:
-    """View interpolation: what `camera` would see, from the frames of other cameras alone.
+    """View interpolation: an image of `camera` from the frames of other cameras.
 
-    Every pixel's point is where its ray meets `scene` first; where `mask (H, W)` has hair and the
-    scene has none, at the depth of the nearest pixel that meets any. The point's colour is that of
-    the `CAMERAS` cameras of `training` nearest in angle about the head, without `camera` and those
-    without frames, by the inverse angle: of those that see it, or of all on whose image it falls
-    where none does.
+    Every pixel's point is the first hit of its ray with `scene`, or, for `mask (H, W)` without a
+    hit, at the depth of the nearest pixel with one. Its colour is the mean, weighted by inverse
+    angle about the head, of the `CAMERAS` nearest cameras of `training` in which it is visible, or,
+    if in none, inside the image.
     """
 
     training: Capture

@@ -1,4 +1,4 @@
-"""Edits of a fitted model: colour, all over or by wisp, roughness, length, other strands."""
+"""Edits of a fitted model: colour, of all hair or a wisp, roughness, length, other strands."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def recoloured(
 ) -> HairMaps:
     """`maps` with the absorption under the `brush (w, h)` in [0, 1] mixed with `sigma_a (3,)`.
 
-    `along` is the part of the strands that is dyed, 0 the root and 1 the tip; a layer is dyed by
-    the share of its span that this covers. Maps with fewer cells than the brush are `refined`.
-    Mixed in the square root of the absorption, in which colours are about evenly spaced. Raises
-    `ValueError` for a brush, an absorption or a part out of range.
+    `along` is the dyed part of the strands, 0 the root and 1 the tip; a layer is dyed by the share
+    of its span in this. Maps with fewer cells than the brush are `refined`. Mixed in the square
+    root of the absorption, which is perceptually even. Raises `ValueError` for a brush, an
+    absorption or a part out of range.
     """
     paint, wanted = np.asarray(brush, float), np.asarray(sigma_a, float)
     if paint.ndim != 2 or not ((paint >= 0) & (paint <= 1)).all():
@@ -62,10 +62,7 @@ def recoloured(
 
 
 def refined(maps: HairMaps, least: tuple[int, int, int]) -> HairMaps:
-    """`maps` of at least the shape `least` that look the same.
-
-    Each cell becomes so many alike; new layers lie on the lines between the old ones.
-    """
+    """Equivalent `maps` of at least the shape `least`: cells repeated, layers interpolated."""
     layers, columns, rows = maps.shape
     if layers < least[0]:
         between = max(layers - 1, 1)
@@ -122,10 +119,7 @@ def _cell_of(root_uv: Array, cells: tuple[int, int]) -> Ints:
 
 
 def _covered(along: tuple[float, float], layers: int) -> Array:
-    """The share `(layers,)` of each layer's span that lies in `along`.
-
-    A layer reaches half a step to either side of its place on the strands.
-    """
+    """The share `(layers,)` of each layer's span, half a step to either side, in `along`."""
     middle, half = np.linspace(0, 1, layers), 0.5 / max(layers - 1, 0.5)
     low, high = np.maximum(middle - half, 0), np.minimum(middle + half, 1)
     inside = np.minimum(high, along[1]) - np.maximum(low, along[0])

@@ -1,4 +1,4 @@
-"""A fitted model: rendered, relit, edited and exported; every picture goes through it."""
+"""A fitted model, to be rendered, relit, edited and exported."""
 
 from __future__ import annotations
 
@@ -80,10 +80,7 @@ class FittedModel:
 
     @classmethod
     def unfitted(cls, model: Model, capture: Capture | None = None) -> FittedModel:
-        """The strands and head of a model without a fit, as brown hair: for who wants strands.
-
-        Raises `ModelError` where it has no strands.
-        """
+        """A model without a fit, as brown hair. Raises `ModelError` if it has no strands."""
         strands, hair = model.strands(), HairAppearance(of_melanin(*BROWN), 0.3, 0.3)
         colour = tuple(float(c) for c in colour_of_absorption(hair.sigma_a, hair.beta_n))
         v = float(variance_of_roughness(hair.beta_m))
@@ -106,10 +103,7 @@ class FittedModel:
         return {"sun_fit": sun, "inverse_rendering": found}
 
     def save(self, model: Model) -> None:
-        """Write a model that `load` reads back; the fit's report and pictures are not copied.
-
-        Its `appearance.json` is of the hair that is rendered, the mean of maps.
-        """
+        """Write a model without report and images; its `appearance.json` has the mean of maps."""
         appearance, hair = self.appearance, self.maps.mean()
         if hair != appearance.hair:
             red, green, blue = colour_of_absorption(hair.sigma_a, hair.beta_n)
@@ -144,11 +138,11 @@ class FittedModel:
         return replace(self, maps=maps)
 
     def without_field(self) -> FittedModel:
-        """The same as its material alone shows it."""
+        """The same without a field."""
         return replace(self, field=None)
 
     def lights(self, names: Sequence[str]) -> list[Light]:
-        """Lights of the rig: as found where they were fitted, else as calibrated."""
+        """Lights of the rig: fitted ones, else as calibrated."""
         if self.rig is None:
             raise ValueError("lights are parts of a rig: give the capture too")
         return [self.rig.light(name) for name in names]
@@ -156,8 +150,8 @@ class FittedModel:
     def scene(self, strands: Strands | None = None, head: Mesh | None = None) -> HairScene:
         """The scene for every renderer of `appearance.render`.
 
-        With moved `strands` and `head` of the same topology; as thick as the model's, whatever a
-        file of a pose says. Raises `ValueError` where the strands' numbers of points differ.
+        With moved `strands` and `head` of the same topology, and the model's radii. Raises
+        `ValueError` if the strands' numbers of points differ.
         """
         moved = self.strands if strands is None else strands
         if not np.array_equal(moved.offsets, self.strands.offsets):

@@ -56,11 +56,11 @@ class LightSums:
 def weights_of_environment(
     lights: Sequence[Light], envmap: AnyFloats, rotation_deg: float = 0.0
 ) -> Array:
-    """What each of `lights` is to be multiplied by to stand for a map: `(L, 3)`.
+    """Factors `(L, 3)` on `lights` that approximate a map.
 
-    Every direction of the lat-long map `(h, w, 3)` (as in `render_environment`) is given to the
-    nearest light that shines in its colour: what its cell sends over the light's own irradiance at
-    the origin. Where the lights leave a part of the sphere empty, the nearest ones stand for it.
+    Every direction of the lat-long map `(h, w, 3)` (as in `render_environment`) is assigned to the
+    nearest light with that channel; a factor is the irradiance of its cell over the light's own at
+    the origin.
     """
     image = subdivided(check_environment(envmap, "environment").astype(float), _ROWS)
     height, width = image.shape[:2]
@@ -87,10 +87,8 @@ def weights_of_environment(
 
 
 def stand_ins(lights: Sequence[Light], weights: Array, there: Bools) -> Array:
-    """`weights (L, 3)` of the lights that are `there (L,)` alone, which stand for all.
-
-    What each other light sends to the origin comes from the nearest that has its colours.
-    """
+    """`weights (L, 3)` moved to the lights that are `there (L,)`: each other light's irradiance
+    goes to the nearest one with its channels."""
     own, unit = irradiance(lights), np.array([x.position for x in lights])
     unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
     out = np.where(there[:, None], weights, 0.0)
@@ -113,7 +111,7 @@ def _nearest(directions: Array, unit: Array) -> Ints:
 
 
 def irradiance(lights: Sequence[Light]) -> Array:
-    """What each light alone sends through the origin across its ray: `(L, 3)`, W/m²."""
+    """Irradiance of each light at the origin, across its ray: `(L, 3)`, W/m²."""
     origin = np.zeros(3)
     return np.array(
         [x.intensity_towards(origin) / np.square(x.position).sum() for x in lights]
@@ -121,11 +119,10 @@ def irradiance(lights: Sequence[Light]) -> Array:
 
 
 def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple[int, Array]]:
-    """At most `most` of `lights` that stand for all at their `weights (L, 3)`: (number, weight).
+    """At most `most` of `lights` that approximate all at their `weights (L, 3)`: (number, weight).
 
-    The brightest are taken apart first: each group, of the lights nearest to one of those chosen,
-    has the irradiance of its members and stands where its brightest one is. None stands for a
-    colour that it does not shine in, unless `most` leaves no other.
+    Lights are grouped by the nearest chosen one, which is the group's brightest and has the group's
+    irradiance. A light only represents channels that it has, unless `most` leaves no other.
     """
     own = irradiance(lights)
     power = weights * own
@@ -139,10 +136,10 @@ def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple
 def lights_in_turn(
     lights: Sequence[Light], weights: Array, most: int, turns: int
 ) -> list[list[tuple[int, Array]]]:
-    """Of each group of `few_lights` which member, at which weight, stands for it in each turn.
+    """Of each group of `few_lights` the members, with weights, that represent it in turn.
 
-    A member has its turn as often as it is bright; the mean over many turns is all of the lights
-    at their own places. A group of one has one turn.
+    A member's frequency is proportional to its irradiance, so that the mean over many turns is that
+    of all lights.
     """
     power = weights * irradiance(lights)
     unit = np.array([x.position / np.linalg.norm(x.position) for x in lights])
@@ -183,5 +180,5 @@ def _groups(lights: Sequence[Light], power: Array, most: int) -> list[tuple[int,
 
 
 def _radical_inverse(i: int) -> float:
-    """Van der Corput's sequence: the binary digits of `i` behind the point, mirrored."""
+    """Van der Corput's sequence in base 2."""
     return int(f"{i:b}"[::-1], 2) / (1 << i.bit_length())

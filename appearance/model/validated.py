@@ -1,4 +1,4 @@
-"""Fits that have to prove themselves: some training frames decide what is rendered."""
+"""Fits with validation: some training frames decide what is rendered."""
 
 from __future__ import annotations
 
@@ -29,13 +29,12 @@ def fit_validated(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """`fit_maps` under some lights, and Sun's fit kept where others say that it is better.
+    """`fit_maps` under some lights, kept if it renders validation lights better than Sun's fit.
 
-    Of the lights that are not `held_out`, `request.lights` are fitted and others judge,
-    `request.validation_lights` or a quarter of them all: directions far apart. Where whole training
-    pictures are not clearly better, or the mean PSNR of the validation frames is not higher than
-    that of Sun's fit, maps and lights are discarded with a warning in the report: whatever is
-    rendered later is Sun's fit. Returns what `fit_maps` does, with
+    Of the lights that are not `held_out`, `request.lights` are fitted and
+    `request.validation_lights` (or a quarter) validate, with directions far apart. If full training
+    images are not clearly better, or the mean PSNR of the validation frames is not higher, maps and
+    lights are discarded with a warning in the report. Returns the result of `fit_maps` with
     `{"validation": {"start" | "inverse_rendering": {"psnr", "ssim", "relative_error"}}}` instead of
     "held_out", and "rendered": "inverse_rendering" or "sun_fit".
     """
@@ -91,16 +90,15 @@ def fit_field_validated(
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Fit a field on top of what the model renders, kept only where it makes pictures better.
+    """Fit a field to the model's residual, kept only if it improves left-out images.
 
-    Of the lights that are not `held_out`, `request.lights` are used: directions far apart. Cameras
-    and lights are left out in turn, and the field is rendered later where pictures under new
-    lights, of new views, and of both each gain by it, and together more than twice the spread;
-    otherwise it is discarded, with a warning in the report, and an earlier field stays. What is
-    kept is fitted to all of the frames. Writes `field.npz` and the stage "field" of the report.
-    Returns `{"validation": {group: {"without", "with", "spread"}} in dB,
-    "gain" (and its spread, None where nothing could be left out), "rendered", "ridge", "clamped",
-    "lights"}`, or "left_out" for the field "none", which removes an earlier one.
+    Of the lights that are not `held_out`, `request.lights` are used, with directions far apart.
+    Cameras and lights are left out in turn; the field is kept if images under new lights, of new
+    views, and of both each gain, and the mean by more than twice its spread. Otherwise it is
+    discarded with a warning in the report, and an earlier field stays. Writes `field.npz`, fitted
+    to all frames, and the stage "field" of the report. Returns `{"validation": {group: {"without",
+    "with", "spread"}} in dB, "gain" (and its spread, None without validation), "rendered", "ridge",
+    "clamped", "lights"}`, or "left_out" for the field "none", which removes an earlier one.
     """
     held_out, request = held_out or HeldOut(), request or FieldRequest()
     report = model.report()
@@ -148,7 +146,7 @@ def fit_field_validated(
 
 
 def _known(values: Sequence[float]) -> list[float | None]:
-    """`values` for JSON: a spread is infinite where nothing could be left out."""
+    """`values` for JSON, with None for infinite ones."""
     return [x if np.isfinite(x) else None for x in values]
 
 

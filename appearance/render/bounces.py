@@ -1,4 +1,4 @@
-"""How many bounces are needed, measured: few in dark hair, many in blond."""
+"""Measures how many bounces are needed: few in dark hair, many in blond."""
 
 from __future__ import annotations
 
@@ -46,11 +46,10 @@ def bounce_limit(
 ) -> BounceLimit:
     """The smallest depth that leaves out at most `share` of the light.
 
-    Measured under light that is alike from everywhere, the mean over all places of a light:
-    there the light that a path brings is its throughput where it leaves the subject, and no light
-    is sampled. A light that reaches a pixel only by many bounces may lose a larger share of
-    its little light. `pixels (P,)` default to those that see the subject; about `paths` paths are
-    spent. The largest depth tried is 256. Raises `ValueError` for `share` outside (0, 1).
+    Measured under uniform light, where a path's contribution is its throughput when it leaves the
+    subject. A light that reaches a pixel only by many bounces may lose a larger share. `pixels
+    (P,)` default to those of the subject; about `paths` paths are traced. The largest depth is 256.
+    Raises `ValueError` for `share` outside (0, 1).
     """
     if not 0 < share < 1:
         raise ValueError(f"share must be between 0 and 1, got {share}")

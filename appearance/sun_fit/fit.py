@@ -60,9 +60,9 @@ MAX_DEPTH = 16
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
 ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
-"""β_M of the renderings; no value outside their range is found."""
+"""β_M of the renderings, the range of the result."""
 ROUGHNESS_PIXELS = 350
-"""Pixels a camera, at most, whose own highlights are matched."""
+"""Most pixels a camera for matching highlights."""
 
 
 def fit(
@@ -76,9 +76,9 @@ def fit(
 ) -> Report:
     """Fit roughness, hair colour and skin colour (Sun 2021, §5) and write `appearance.json`.
 
-    Reads `strands.npz` and `masks/` of the folder `model` and the OLAT frames of `capture` that are
-    not `held_out`. The stages "samples", "roughness" and "colour" go into the model's `report.json`
-    and the report is returned. Raises `CaptureError` or `ValueError` naming what is missing.
+    Uses the model's strands and masks and the OLAT frames of `capture` that are not `held_out`. The
+    returned report, also the model's, has the stages "samples", "roughness" and "colour". Raises
+    `CaptureError` or `ValueError` naming what is missing.
     """
     held_out, options = held_out or HeldOut(), options or FitOptions()
     training = held_out.training(capture)
@@ -127,7 +127,7 @@ def fit(
 
 
 def _spread(observed: Observed) -> Ints:
-    """Places of `ROUGHNESS_PIXELS` of the pixels, evenly."""
+    """Indices of `ROUGHNESS_PIXELS` of the pixels, evenly spaced."""
     count = len(observed.pixels)
     return np.linspace(0, count - 1, min(count, ROUGHNESS_PIXELS)).astype(int)
 
@@ -136,9 +136,8 @@ def _spread(observed: Observed) -> Ints:
 class Roughnesses:
     """The roughness by three methods.
 
-    `matched` is that of the renderings that match the capture, `plain` the lobe of the capture's
-    own samples, `printed` the variance by Eq. 10 as it is printed, `first` the colour that went
-    into the renderings.
+    `matched` by renderings that match the capture, `plain` by the lobe of the capture's samples,
+    `printed` the variance by Eq. 10 as printed. `first` is the colour of the renderings.
     """
 
     matched: Roughness
@@ -169,7 +168,7 @@ class SunFit:
         if len(views) < len(hair):
             stage.leave_out(
                 f"{len(hair) - len(views)} of {len(hair)} cameras",
-                "the highlight is the same from all of them",
+                "the highlight is the same in all of them",
                 f"{1 - len(views) / len(hair):.0%} of the renderings",
             )
         views = [(o, f) for o, f in views if len(o.lights)]
@@ -184,7 +183,7 @@ class SunFit:
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
         skin, unreported = np.array(self.scene.skin), Stage("first colour")
-        # that of all light: near a highlight, what comes from other fibres does from all sides
+        # of all light: near a highlight, indirect light comes from all directions
         first = self.colour(plain.beta_m, None, skin, unreported, pixels=self.covered)
         captured, highlights = self._highlights(views, channel)
 
@@ -218,12 +217,12 @@ class SunFit:
 
     @cached_property
     def covered(self) -> FitPixels:
-        """The pixels by which colours are compared."""
+        """The pixels for comparing colours."""
         return covered(self.pixels, self.scene)
 
     @cached_property
     def in_front(self) -> FitPixels:
-        """Those, but hair under lights on its camera's side only, for its colour."""
+        """Those, with hair under lights on its camera's side only."""
         return in_front(self.covered, self.scene)
 
     def colour(
@@ -236,8 +235,7 @@ class SunFit:
     ) -> Colours:
         """Hair and skin colour at a roughness, from albedos `start (3,)` and `skin (3,)`.
 
-        They are matched in `pixels`, those `in_front` unless given. Errors against run time go into
-        `stage`.
+        Matched in `pixels`, by default `in_front`. `stage` gets errors against run time.
         """
         began = time.perf_counter()
         series = Series("hair colour", "relative error of the mean colour under uniform light")
@@ -256,7 +254,7 @@ class SunFit:
             sampling=Sampling(self.options.colour_spp, MAX_DEPTH, self.seed),
             on_iteration=on_iteration,
         )
-        seen, kept = (sum(len(o.pixels) for o in p.hair) for p in (self.pixels, self.covered))
+        count, kept = (sum(len(o.pixels) for o in p.hair) for p in (self.pixels, self.covered))
         if self.covered.hair is self.pixels.hair:
             stage.warn(
                 "The strands cover under a tenth of the pixels that show hair, so its colour is "
@@ -272,11 +270,11 @@ class SunFit:
                 "The head covers under a tenth of the pixels that show skin, so its colour is too "
                 "light: check that masks and head are of one capture."
             )
-        if kept < seen:
+        if kept < count:
             why = f"the strands cover less than {COVERED:.0%} of each"
-            stage.leave_out(f"{seen - kept} of {seen} hair pixels", why, "their renderings")
+            stage.leave_out(f"{count - kept} of {count} hair pixels", why, "their renderings")
         if self.in_front.hair is not self.covered.hair:
-            why = "strands that are off change light that comes through them most"
+            why = "errors of strands change transmitted light most"
             stage.leave_out("lights behind the hair", why, "their renderings")
         stage.figures |= {
             "colour": list(result.colour),
@@ -309,7 +307,7 @@ class SunFit:
         return [float(x) if np.isfinite(x) else None for x in errors]
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:
-        """Pixels of hair of one direction, their fibres, the lights near a mirror."""
+        """Pixels of hair of one direction with fibres, under lights near their mirror direction."""
         out = []
         for o in hair:
             fibres = visible_fibres(self.scene, o.camera, o.pixels, seed=self.seed)
@@ -319,7 +317,7 @@ class SunFit:
     def _under(
         self, o: Observed, fibres: VisibleFibres, pixels: Bools | Ints
     ) -> tuple[Observed, VisibleFibres]:
-        """Some of the pixels, their fibres, the lights near a mirror direction of them."""
+        """Some of the pixels with fibres, under lights near their mirror direction."""
         o, fibres = o.where(pixels), fibres.where(pixels)
         near = mirror_lights(o, fibres, tilt_deg=self._tilt, window=WINDOW)
         return o.under(near), fibres
@@ -327,7 +325,7 @@ class SunFit:
     def _highlights(
         self, views: Sequence[tuple[Observed, VisibleFibres]], channel: int
     ) -> tuple[Highlight, Highlights]:
-        """The highlight of the capture in some pixels of these views, and its reader."""
+        """The capture's highlight in some pixels of these views, and the `Highlights`."""
         few = [self._under(o, fibres, _spread(o)) for o, fibres in views]
         few = [(o, fibres) for o, fibres in few if len(o.lights)]
         highlights = Highlights(few, self._tilt, channel)
@@ -341,11 +339,11 @@ class SunFit:
         return fit_lobe(bins), fit_lobe_as_printed(bins), int(bins.count.sum())
 
     def _halves(self, scene: HairScene, o: Observed, number: int) -> Floats:
-        """Two renderings `(2, L, P, 3)` of a view, half the samples and own noise each."""
+        """Two independent renderings `(2, L, P, 3)` of a view with half of the samples each."""
         spp = max(self.options.roughness_spp // 2, 1)
-        spent = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 11)))
+        sampling = asdict(Sampling(spp, MAX_DEPTH, self.seed + (number << 11)))
         twice = np.tile(o.pixels, 2)
-        images = render_olat(scene, o.camera, o.lights, pixels=twice, **spent)
+        images = render_olat(scene, o.camera, o.lights, pixels=twice, **sampling)
         return np.stack(np.split(images, 2, axis=1))
 
     @property

@@ -1,4 +1,4 @@
-"""Which pixels of a capture a fit reads: hair and skin."""
+"""Hair and skin pixels that a fit observes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COVERED = 0.9
 
 @dataclass(frozen=True, eq=False)
 class FitPixels:
-    """What the cameras observed: hair, and skin where any is visible."""
+    """Observed hair, and skin if any is visible."""
 
     hair: Sequence[Observed]
     skin: Sequence[Observed] = ()
@@ -37,10 +37,7 @@ def observed_pixels(
     progress: Progress,
     seed: int,
 ) -> FitPixels:
-    """Read hair and skin of all cameras; raises `ValueError` where there is no hair, or it is dark.
-
-    How much was read, and left out, goes into `stage`.
-    """
+    """Read hair and skin of all cameras; raises `ValueError` if there is no hair or it is dark."""
     rng = np.random.default_rng(seed)
     cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
     hair, skin, hair_pixels = [], [], 0
@@ -72,14 +69,14 @@ def observed_pixels(
     if kept < hair_pixels:
         stage.leave_out(
             f"{hair_pixels - kept} of {hair_pixels} hair pixels",
-            "means and lobes are known to a per cent from the others",
+            "the others determine means and lobes to one per cent",
             f"{1 - kept / hair_pixels:.0%} of the renderings",
         )
     return FitPixels(hair, skin)
 
 
 def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Stage) -> FitPixels:
-    """Leave out the lights that reach no hair pixel of any camera."""
+    """Without the lights that reach no hair pixel of any camera."""
     hair, noise = pixels.hair, 0.0
     for o in hair[:1]:
         for step in training.of_kind("dark"):
@@ -103,10 +100,9 @@ def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Sta
 
 
 def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
-    """Those of hair and skin that show the scene's hair or head, too, by `COVERED`.
+    """Pixels that the scene's hair or head covers by `COVERED`; all if that is less than a tenth.
 
-    Where strands are missing, or stand before bare skin, a rendering is of another colour than the
-    hair, whatever the hair's is. All of them where the scene covers less than a tenth.
+    Elsewhere missing strands would bias the rendered colour.
     """
 
     def of(views: Sequence[Observed], what: str) -> Sequence[Observed]:
@@ -120,10 +116,10 @@ def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:
 
 
 def in_front(pixels: FitPixels, scene: HairScene) -> FitPixels:
-    """The hair under lights on its camera's side of the scene; under all where none is there.
+    """The hair under lights on its camera's side of the scene; under all lights if there is none.
 
-    How much light comes through hair from behind is a matter of how many strands there are and how
-    far apart, which a reconstruction knows less well than where they lie.
+    Transmitted light depends on the strands' density, which a reconstruction determines less well
+    than their positions.
     """
     nearer = [
         (o, np.flatnonzero(cosines_of_lights(scene, o) > 0).astype(np.int64)) for o in pixels.hair
@@ -133,7 +129,7 @@ def in_front(pixels: FitPixels, scene: HairScene) -> FitPixels:
 
 
 def cosines_of_lights(scene: HairScene, o: Observed) -> Array:
-    """Cosine `(L,)` between the ways from the middle of the scene to each light and the camera."""
+    """Cosine `(L,)` between the directions from the scene's middle to each light and the camera."""
     middle = np.array(scene.mi_scene.bbox().center()).ravel() / SCALE
     ways = np.array([x.position for x in o.lights]).reshape(-1, 3) - middle
     towards = o.camera.center - middle

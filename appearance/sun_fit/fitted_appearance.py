@@ -34,14 +34,13 @@ def absorption_warnings(sigma_a: Sequence[float], errors: Sequence[float | None]
 class FittedAppearance:
     """A model's appearance.
 
-    `hair` is what to render the model's strands with: strands that are smoother than hair are
-    rendered rougher than its fibres are. `colour (3,)` is the multiple-scattering albedo behind
-    its absorption, `skin (3,)` a diffuse albedo, `exposure` the capture's. `v` is the longitudinal
-    variance behind `hair.beta_m`; `plain_v` and `printed_v` are what the captured lobe reads before
-    the correction by rendering, with a floor and (as Sun's Eq. 10) without. `held_out` is what
-    the fit did not observe. `beta_m_error` is the standard error of log β_M, `beta_m_interval` an
-    interval of about 95 %, and `sigma_a_error (3,)` the standard error of log sigma_a, None in a
-    channel whose colour does not depend on it. All three are None if `hair` was not fitted.
+    `hair` is the material to render the model's strands with. `colour (3,)` is the
+    multiple-scattering albedo of its absorption, `skin (3,)` a diffuse albedo, `exposure` the
+    capture's. `v` is the longitudinal variance of `hair.beta_m`; `plain_v` and `printed_v` are
+    those of the captured lobe with a floor and, as Sun's Eq. 10, without. `held_out` are the frames
+    not used. `beta_m_error` is the standard error of log β_M, `beta_m_interval` an interval of
+    about 95 %, and `sigma_a_error (3,)` the standard error of log sigma_a, None in a channel whose
+    colour does not depend on it. All three are None if `hair` was not fitted.
     """
 
     hair: HairAppearance

@@ -1,4 +1,4 @@
-"""The hair of a view in parts: sums over each, and jackknife errors over them."""
+"""Parts of a view's hair: sums over each, and jackknife errors over them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from appearance.observations import Observed
 from reconstruction.arrays import Array, Ints
 
 SIDE = 3
-"""A view's hair is parted in 3 × 3."""
+"""A view's hair is divided into 3 × 3 parts."""
 FEWEST_PAIRS = 200
 """Fewest pairs of lights, over all pixels, for an estimate."""
 FEWEST_OF_VIEW = 1000
@@ -38,10 +38,8 @@ def summed(place: Ints, values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def leaving_out(pairs: Array) -> tuple[Array, int]:
-    """Weights `(M, J)` of parts that have `pairs (J,)`: of all, of all but one, of single views.
-
-    And how many leave one out.
-    """
+    """Weights `(M, J)` of parts that have `pairs (J,)`: all, all but one, and single views; and the
+    number of those that leave one out."""
     parts = len(pairs)
     left_out = (1 - np.eye(parts))[pairs > 0]
     views = np.kron(np.eye(parts // SIDE**2), np.ones(SIDE**2))

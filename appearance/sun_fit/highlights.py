@@ -1,7 +1,7 @@
-"""The response of pixels to lights near their mirror direction, and to pairs of those.
+"""Responses of pixels to lights near their mirror direction, and their products over pairs.
 
-It is read in the same way from a capture and from renderings of known roughness, which
-`light_correlation` compares.
+Measured in the same way on a capture and on renderings of known roughness, for
+`light_correlation`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from appearance.sun_fit.visible_fibres import VisibleFibres
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 WINDOW = np.pi / 3
-"""How far from the mirror direction lights are taken, both ways."""
+"""Largest deviation of lights from the mirror direction."""
 EDGES = np.radians([0, 8, 16, 24, 32, 40, 50, 60, 75, 90, 120])
 """Bins of |θ_i − θ_i'| of two lights."""
 INNER = slice(4, 26)
@@ -47,7 +47,7 @@ class Highlight:
 
     @classmethod
     def joined(cls, views: Sequence[Self]) -> Self:
-        """The highlights of several views as one; of none, nothing."""
+        """The highlights of several views as one."""
         none = (np.zeros((0, len(edges) - 1)) for edges in 2 * [EDGES] + 2 * [_DEVIATIONS])
         return cls(
             *(
@@ -127,7 +127,7 @@ class LightPairs:
     def highlight(self, one: AnyFloats, other: AnyFloats) -> Highlight:
         """The highlight in the radiances `one`, `other (L, P)` of the same pixels.
 
-        They are the same twice, or two renderings: then mean products are free of their noise.
+        Products of two independent renderings have no noise bias.
         """
         a, b = (np.asarray(self.scale * x, float).ravel() for x in (one, other))
         i, j, k = self.first, self.second, self.sample

@@ -14,11 +14,11 @@ from appearance.sun_fit.visible_fibres import VisibleFibres
 from reconstruction.arrays import Array, Bools, Ints
 
 WINDOW = np.pi / 6
-"""Sun Eq. 9: how far from the mirror direction samples are taken, both ways."""
+"""Sun Eq. 9: largest deviation of samples from the mirror direction."""
 BINS = 32
 LEAST_SHARE, MOST_SPREAD = 0.9, 0.06
 LEAST_LIT = 0.1
-"""Least part of a light's brightest pixel: below it, other hair lights a pixel more."""
+"""Least share of a light's largest intensity in a pixel; below it indirect light dominates."""
 _PAIRS = 96  # directions kept a bin, each with all its pixel's fibres, to average the model over
 
 
@@ -75,8 +75,8 @@ def mirror_samples(
 ) -> MirrorSamples:
     """Samples of one view with |θ_i + θ_o + 2 tilt| and |φ_i − φ_o| below π/6 (Eq. 9).
 
-    `channel` is the colour channel to take: the darkest has the least light from inside the fibres.
-    Pixels that are not `usable` are left out.
+    `channel` should be the darkest, with the least light from inside the fibres. Pixels that are
+    not `usable` are left out.
     """
     found = near_mirror(observed, fibres, tilt_deg)
     light, pixel = np.nonzero(found.near)
@@ -105,8 +105,7 @@ def mirror_lights(
 def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
     """Average the samples in 32 bins of |deviation| up to π/6 (Sun §5.1).
 
-    Raises `ValueError` where under 100 samples in 8 bins are left: the lights are too few, or the
-    hair's directions unknown.
+    Raises `ValueError` for fewer than 100 samples or 8 bins.
     """
     inside = np.abs(samples.deviation) < WINDOW
     bin_of = np.where(inside, (np.abs(samples.deviation) / WINDOW * BINS).astype(int), BINS)
@@ -138,8 +137,8 @@ class NearMirror:
     """Which lights are near the mirror direction of which pixels, `near (L, P)`.
 
     `deviation (L, P)` is θ_i + θ_o + 2 tilt at the pixel's mean tangent; `middle (P, 3)` the mean
-    of the points that its rays met, `towards (L, P, 3)` and `squared (L, P)` the unit direction and
-    the squared distance from there to the light, `shines (L, P, 3)` what it sends there, W/sr.
+    of its rays' hits, `towards (L, P, 3)` and `squared (L, P)` the unit direction and squared
+    distance from there to the light, `shines (L, P, 3)` the light's intensity, W/sr.
     """
 
     near: Bools
@@ -163,8 +162,8 @@ def near_mirror(
 ) -> NearMirror:
     """Samples with |θ_i + θ_o + 2 tilt| below `window` and |φ_i − φ_o| below π/6.
 
-    The fibres run along the mean tangent of each pixel. Pixels that are not `usable` are left out,
-    and lights where they send under `LEAST_LIT` of their most.
+    Fibres are along each pixel's mean tangent. Pixels that are not `usable` are left out, and
+    lights below `LEAST_LIT` of their largest intensity.
     """
     middle = _middle(fibres)
     mean = fibres.mean_tangent()
@@ -191,7 +190,7 @@ def _positions(observed: Observed) -> Array:
 
 
 def _middle(fibres: VisibleFibres) -> Array:
-    """Mean of the points that a pixel's rays met `(P, 3)`."""
+    """Mean of a pixel's hits `(P, 3)`."""
     count = np.maximum(fibres.hair.sum(axis=1), 1)
     return np.asarray(fibres.point.sum(axis=1, dtype=float) / count[:, None])
 

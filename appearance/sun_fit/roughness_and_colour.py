@@ -1,9 +1,8 @@
 """Roughness and colour of hair from OLAT frames (Sun et al. 2021, §5).
 
 Roughness: pixel values near the mirror direction, binned over the deviation from it, are a lobe on
-a floor of multiple scattering; the lobe's variance is the roughness (`fit_lobe`).
-Three things bias that: hairs light each other near the mirror direction too, other lobes lie under
-the first, and tangents that are off widen it. The roughness that a fit ends at is that of
+a floor of multiple scattering; the lobe's variance gives the roughness (`fit_lobe`). It is biased
+by multiple scattering, by other lobes and by errors of tangents: the result of a fit is that of
 `light_correlation`. Colour: Algorithm 1 with Eq. 11 and 12 (`fit_colour`).
 """
 
@@ -37,9 +36,9 @@ SAMPLING = Sampling(32, 16)
 TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
 MORE = 2.0
-"""Renderings of this factor times the absorption, and of its inverse, give the derivative."""
+"""Factor on the absorption of the two renderings for the derivative."""
 LEAST_PATHS = 100_000
-"""Fewest paths of each of those renderings, against noise in the derivative."""
+"""Fewest paths of each of those renderings."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ def fit_lobe(bins: LobeBins) -> Lobe:
     Sun's Eq. 10 has no floor and reads twice the variance where multiple scattering adds a fifth of
     the peak. Gain and floor are solved for each v; v by a grid in log v and Brent's method.
     """
-    # not the bins' own errors: a bin that missed its rare bright samples has a small error too
+    # not the bins' own errors: a bin without rare bright samples has too small an error
     weight = np.sqrt(bins.count / bins.count.mean())
 
     def solve(log_v: float) -> tuple[Array, float]:
@@ -88,7 +87,7 @@ def fit_lobe_as_printed(bins: LobeBins) -> float:
 
 
 def _minimum(error: Callable[[float], float]) -> float:
-    """Where `error` of log v is least, over the roughness that hair can have."""
+    """The log v of least `error`, over the roughness of hair."""
     ends = np.log(variance_of_roughness(np.array([LEAST_ROUGHNESS, GREATEST_ROUGHNESS])))
     grid = np.linspace(ends[0], ends[1], 49)
     best = int(np.argmin([error(float(x)) for x in grid]))
@@ -100,8 +99,7 @@ def _minimum(error: Callable[[float], float]) -> float:
 class Colours:
     """The result of Algorithm 1: C, its hair and the skin's albedo.
 
-    `pairs` are the C that were rendered, each `(3,)`, and the hair's mean colours; `errors` how far
-    off each was, relative.
+    `pairs` are the rendered C `(3,)` with the hair's mean colours; `errors` their relative errors.
     """
 
     colour: tuple[float, float, float]
@@ -123,11 +121,10 @@ def fit_colour(
     """Sun's Algorithm 1: the multiple-scattering albedo C whose rendering has the captured colour.
 
     The light is the mean of the single lights. `scene` gives geometry, roughness and first skin
-    albedo, `start (3,)` the first C. An iteration renders the observed pixels, fits R = aC + b per
-    channel (Eq. 12), takes Eq. 11's sigma of the next C, and passes its error to `on_iteration`.
-    The skin's albedo follows by the ratio of captured to rendered. Ends when the hair's mean colour
-    is within `TOLERANCE`, or after `iterations` with one more update. Every rendering draws other
-    random numbers, so that the fit averages their noise.
+    albedo, `start (3,)` the first C. An iteration renders the observed pixels with own random
+    numbers, fits R = aC + b per channel (Eq. 12), takes Eq. 11's sigma of the next C, and passes
+    its error to `on_iteration`. The skin's albedo is scaled by the ratio of captured to rendered.
+    Ends when the hair's mean colour is within `TOLERANCE`, or after `iterations`.
     """
     if not isinstance(scene.hair, HairAppearance):
         raise TypeError("fit_colour needs a scene with HairAppearance, not diffuse fibres")
@@ -144,15 +141,13 @@ def fit_colour(
         lit = scene.with_hair(current).with_skin(np.clip(albedo, 0, 1))
         now = replace(sampling, seed=sampling.seed + step)
         views = [_rendered(lit, o, now) for o in pixels.hair]
-        seen = _mean_colour(views)
-        errors.append(_off(seen, target))
+        rendered = _mean_colour(views)
+        errors.append(_off(rendered, target))
         on_iteration(errors[-1])
-        pairs.append((colour, seen))
+        pairs.append((colour, rendered))
         if skin_target is not None and step < 3:
-            skin_seen = _mean_colour([_rendered(lit, o, now) for o in pixels.skin])
-            albedo = np.clip(
-                albedo * skin_target / np.maximum(skin_seen, 1e-12), LEAST_SKIN, MOST_SKIN
-            )
+            skin = _mean_colour([_rendered(lit, o, now) for o in pixels.skin])
+            albedo = np.clip(albedo * skin_target / np.maximum(skin, 1e-12), LEAST_SKIN, MOST_SKIN)
         if errors[-1] < TOLERANCE and step > 0:
             break
         colour = next_colour(pairs, target)
@@ -165,10 +160,9 @@ def absorption_error(
 ) -> Array:
     """Standard error of log sigma_a `(3,)`, over pixels under lights from all around.
 
-    The mean captured colour over the rendered one scatters over parts of the hair, between views,
-    and between lights before, beside and behind it, if the geometry is off. It is divided by the
-    derivative of the mean colour by log sigma_a. Infinite in a channel without a derivative, as
-    black hair is no darker for more absorption, and at an end of C's range.
+    The scatter of captured over rendered colour between parts of the hair, views and directions of
+    light, divided by the derivative of the mean colour by log sigma_a. Infinite in a channel
+    without a derivative, as of black hair, and at an end of C's range.
     """
     paths = sampling.spp * sum(len(o.pixels) for o in hair)
     sampling = replace(sampling, spp=sampling.spp * max(1, LEAST_PATHS // max(paths, 1)))
@@ -181,20 +175,18 @@ def absorption_error(
         for x in each
     )
     bright, dark = (np.maximum(_mean_colour(views), 1e-12) for views in (less, more))
-    slope = np.log(bright / dark) / (2 * np.log(MORE))
+    gradient = np.log(bright / dark) / (2 * np.log(MORE))
     colour = np.array(colours.colour)
-    known = (slope > 0) & (colour > LEAST_ALBEDO) & (colour < MOST_ALBEDO)
+    known = (gradient > 0) & (colour > LEAST_ALBEDO) & (colour < MOST_ALBEDO)
     scatter = np.maximum(_scatter(hair, lit), _disagreement(scene, hair, lit))
-    return np.where(known, scatter / np.where(known, slope, 1.0), np.inf)
+    return np.where(known, scatter / np.where(known, gradient, 1.0), np.inf)
 
 
 def fit_diffuse(
     scene: HairScene, hair: Sequence[Observed], *, seed: int = 0
 ) -> tuple[float, float, float]:
-    """The albedo of Lambertian fibres on the same strands that gives the captured mean colour.
-
-    Algorithm 1 with the albedo in the place of C: the baseline that a hair BSDF has to beat.
-    """
+    """The albedo of Lambertian fibres that gives the captured mean colour, by Algorithm 1: a
+    baseline."""
     target = _mean_colour(hair)
     albedo = np.clip(_as_albedo(hair), 0.02, 0.98)
     pairs: list[tuple[Array, Array]] = []
@@ -211,9 +203,8 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
     """The next C of Algorithm 1 from the pairs (C, R) so far, each `(3,)`, and the captured R.
 
     The first step scales C by the ratio of captured to rendered; later ones solve Eq. 12's line,
-    fitted to all pairs, for the captured R. Pairs weigh more the nearer the target they are, so
-    that the line follows the curve's bend. A step stays within a factor of 2 of the nearest pair,
-    and C in [`LEAST_ALBEDO`, `MOST_ALBEDO`].
+    fitted to all pairs with more weight near the target, for the captured R. A step stays within a
+    factor of 2 of the nearest pair, and C in [`LEAST_ALBEDO`, `MOST_ALBEDO`].
     """
     c, r = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     out = np.empty(3)
@@ -232,8 +223,8 @@ def next_colour(pairs: Sequence[tuple[Array, Array]], target: Array) -> Array:
     return np.clip(out, LEAST_ALBEDO, MOST_ALBEDO)
 
 
-def _off(seen: Array, target: Array) -> float:
-    return float(np.linalg.norm(seen - target) / np.linalg.norm(target))
+def _off(colour: Array, target: Array) -> float:
+    return float(np.linalg.norm(colour - target) / np.linalg.norm(target))
 
 
 def _with_colour(hair: HairAppearance, colour: Array, beta_n: float) -> HairAppearance:
@@ -246,8 +237,8 @@ def _rgb(values: Array) -> tuple[float, float, float]:
 
 def _rendered(scene: HairScene, o: Observed, sampling: Sampling) -> Observed:
     """The same pixels under the same lights, rendered; lights sampled, as only means are used."""
-    spent = {**asdict(sampling), "first_lights": 8, "deep_lights": 4, "thrift": 0}
-    return replace(o, radiance=render_olat(scene, o.camera, o.lights, pixels=o.pixels, **spent))
+    options = {**asdict(sampling), "first_lights": 8, "deep_lights": 4, "thrift": 0}
+    return replace(o, radiance=render_olat(scene, o.camera, o.lights, pixels=o.pixels, **options))
 
 
 def _mean_colour(views: Sequence[Observed]) -> Array:
