@@ -1,8 +1,7 @@
 """Line stereo with and without lightcodes, and fused, on patches of two heads.
 
 And on the capture that Cycles rendered. Captures go through the wires once and are kept. Leaves
-`light_codes/SUBJECT/` with `patch.json` and the models, and `light_codes.json`; with `--cleaner`
-`cleaner_frames.json`.
+`light_codes/SUBJECT/` with `patch.json` and the models, and `light_codes.json`.
 """
 
 from __future__ import annotations
@@ -18,10 +17,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, option, within
-from benchmarks.light_codes.cleaner_frames import compare_frames
+from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, cycles_folder, within
 from benchmarks.light_codes.rig import TARGETS, Patch, patch
-from benchmarks.light_codes.study import compare_filters, study_depths
 from benchmarks.pictures import picture_strands
 from benchmarks.results import save
 from benchmarks.strand_truth import StrandTruth, write_hair_masks
@@ -31,8 +28,6 @@ from reconstruction import (
     Model,
     Progress,
     ReconstructOptions,
-    Report,
-    Strands,
     import_folder,
     read_strands,
     reconstruct,
@@ -40,20 +35,13 @@ from reconstruction import (
 )
 from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
-from reconstruction.images.orientation import texture
-from reconstruction.light_codes.line_strands import build_views
-from reconstruction.masks import MaskedCapture, hair_masks
 from reconstruction.methods import Method
-from reconstruction.report.plots import plot_geometry, plot_report
-from reconstruction.report.report import Series
+from reconstruction.report.plots import plot_geometry
 from stage_service.cli.support.tables import geometry_table
 
 METHODS: tuple[Method, ...] = ("lmvs", "photometric", "fused")
 CAMERAS, LIGHTS = (12, 6), (18, 9)
 OPTIONS = ReconstructOptions()
-CLEANER = option(
-    "--cleaner", "only one small patch, by the noise of its frames", action="store_true"
-)
 
 
 def part_of(capture: Capture, cameras: int | None = None, lights: int | None = None) -> Capture:
@@ -80,8 +68,8 @@ def run_patch(
 ) -> dict[str, Any]:
     """All methods and both baselines on a patch.
 
-    `thinner` also runs `photometric` with fewer cameras and with fewer lights, and `study`. Models
-    are left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
+    `thinner` also runs `photometric` with fewer cameras and with fewer lights. Models are
+    left in `OUT/<method>`, figures in `OUT/patch.json` as they come.
     """
     folder, truth_folder = here.capture.make(cache, within(progress, "capture", 0.0, 0.4))
     capture = Capture(folder)
@@ -108,10 +96,6 @@ def run_patch(
             "stages": {s.name: s.seconds for s in report.stages},
         }
         save(out / "patch.json", results)
-    if thinner:
-        progress("error against run time", 1 - part)
-        results["study"], results["filters"] = study(capture, truth.strands, OPTIONS, out)
-        save(out / "patch.json", results)
     progress("baselines", 1 - part)
     results["variants"] |= truth.baselines(Model(out / "photometric"), OPTIONS.grid)
     save(out / "patch.json", results)
@@ -121,31 +105,6 @@ def run_patch(
         sets[m] = here.ball.cut(Model(out / m).strands())
     picture_strands(out / "strands.png", capture.rig.cameras[0], sets)
     return results
-
-
-def study(
-    capture: Capture, truth: Strands, options: ReconstructOptions, out: Path
-) -> tuple[dict[str, Any], dict[str, float]]:
-    """What the depth search finds against what it costs, and the filter bank beside OpenCV's loop.
-
-    On every eighth view. Also drawn, as `OUT/study/error_*.png`.
-    """
-    codes = options.light_codes
-    masks = hair_masks(capture, None, capture.head)
-    views, volume = build_views(
-        MaskedCapture(capture, masks), capture.head, Report(), options=codes
-    )
-    found = study_depths(views, volume, truth, codes, range(1, len(views), 8))
-    report = Report()
-    for name, variants in found.items():
-        with report.stage(name) as stage:
-            points = [(v["seconds"], 1 - v["right"]) for v in variants.values()]
-            stage.series.append(Series(name, "share of pixels that are wrong", points))
-    plot_report(report, out / "study")
-    camera = capture.rig.cameras[0]
-    image, _ = capture.light(capture.olat_lights()[0], camera.name)
-    pixels = texture(image.mean(axis=-1), masks[camera.name].hair)
-    return found, compare_filters(codes.bank, pixels)
 
 
 def run_imported(
@@ -177,14 +136,7 @@ def run_imported(
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Every patch of `TARGETS`, or one; fewer cameras and lights, and `study`, on Sintel's only."""
-    if args.cleaner:
-        found = compare_frames(
-            args.out / "cleaner_frames", seed=args.seed, quick=args.quick, progress=progress
-        )
-        Console(stderr=True).print(geometry_table(found))
-        save(args.out / "cleaner_frames.json", found)
-        return found
+    """Every patch of `TARGETS`, or one; fewer cameras and lights on Sintel's only."""
     if args.only not in (None, *TARGETS):
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(TARGETS)}")
     names = ["wavy"] if args.quick else [n for n in TARGETS if args.only in (None, n)]
@@ -212,4 +164,4 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     return results
 
 
-BENCHMARK = Benchmark(run, (CACHE, ONLY, CLEANER))
+BENCHMARK = Benchmark(run, (CACHE, ONLY))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from benchmarks.light_planes.motion_errors import motion_errors, true_motion
-from benchmarks.light_planes.solver_study import compare_solvers
-from benchmarks.light_planes.stage_costs import of_field, of_strands, of_triangulation
 from benchmarks.light_planes.without_help import calibrated, copied, rig_errors
 from benchmarks.pictures import picture_model, picture_motion
 from benchmarks.results import save
@@ -21,24 +19,17 @@ from reconstruction import (
     Progress,
     ReconstructOptions,
     Report,
-    Stage,
     reconstruct,
     silent,
 )
 from reconstruction.arrays import AnyFloats
-from reconstruction.growth.field import field_system, solve_field
-from reconstruction.growth.hair_envelope import build_envelope
-from reconstruction.head.scalp import find_scalp
 from reconstruction.light_planes import (
     Motion,
     solve_motion,
     sweep_peaks,
     triangulate,
 )
-from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.reconstruct_options import MotionOptions, RefineOptions
-from reconstruction.report.plots import plot_report
-from reconstruction.tangents.estimate import measure_tangents
 
 PAPER = {
     "side_responses": "75 % of bright pixels",
@@ -73,8 +64,7 @@ def study(
 
     `grown` adds the strands as they grew, not refined.
     `without_help` adds runs without the given head and rig, and with true masks.
-    `studies` adds, for one subject: strands with true and without motion, error against run time
-    of motion and field, and the stages' costs by size.
+    `studies` adds strands with true and without motion.
     """
     capture = Capture(case.still[0])
     truth = StrandTruth(capture, case.still[1])
@@ -114,9 +104,6 @@ def study(
         save(out / "result.json", result)
         points = truth.strands.points[::50]
         result["motion"] = motion_study(moving, points, known, progress)
-        save(out / "result.json", result)
-    if studies:
-        result["series"], result["costs"] = _studies(capture, still, options, progress)
         save(out / "result.json", result)
     return result
 
@@ -174,35 +161,6 @@ def motion_study(
         seconds = time.perf_counter() - begin
         out[method] = {"seconds": seconds, **motion_errors(capture, points, solved, true)}
     return out
-
-
-def _studies(
-    capture: Capture, model: Model, options: ReconstructOptions, progress: Progress
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Error against run time of solvers, and the stages' costs by size, in `model`'s hair."""
-    progress("studies", 0.0)
-    head = capture.head
-    assert head is not None
-    cloud, masks = model.points(), {}
-    for camera in capture.rig.cameras:
-        hair, skin = (model.mask(camera.name, kind, capture) for kind in KINDS)
-        masks[camera.name] = HairMask(hair | skin, hair, skin, "user", 1.0)
-    masked, stage = MaskedCapture(capture, masks), Stage("study")
-    envelope, depths = build_envelope(
-        masked, cloud, head, grid=options.grid, margin=options.margin, stage=stage
-    )
-    measured = measure_tangents(masked, cloud.points, depths, options.measure, stage, progress)
-    system = field_system(envelope, measured.points, measured.directions, measured.confidence)
-    solvers = compare_solvers(*system.equations())
-    field, _ = solve_field(envelope, measured.points, measured.directions, measured.confidence)
-    scalp = find_scalp(head, envelope)
-    costs = [
-        *of_triangulation(capture),
-        of_field(envelope, measured),
-        of_strands(field, scalp, options.max_length),
-    ]
-    plot_report(Report([Stage("solvers", series=list(solvers))]), model.path.parent / "plots")
-    return {"solvers": [asdict(s) for s in solvers]}, [cost.to_dict() for cost in costs]
 
 
 def _shares(report: Report) -> dict[str, float]:

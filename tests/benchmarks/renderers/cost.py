@@ -34,7 +34,6 @@ class Effort:
     bounces: Sequence[int] = (1, 2, 4, 8, 16, 32)
     growth_pixels: Sequence[int] = (200, 800, 3200)
     growth_spp: int = 32
-    rows: int = 768
 
 
 @dataclass(frozen=True)

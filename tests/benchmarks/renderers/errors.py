@@ -1,6 +1,6 @@
 """Our renderers beside Mitsuba's own path integrator, and how their cost grows.
 
-Error against run time light by light and line by line. Leaves `renderers.json`, `renderers.png` and
+Error against run time light by light. Leaves `renderers.json`, `renderers.png` and
 `renderers_growth.png`.
 """
 
@@ -18,18 +18,17 @@ import numpy as np
 from appearance import render_olat
 from appearance.render.bounces import bounce_limit
 from benchmarks.command import SUBJECT, Benchmark
-from benchmarks.renderers.cost import Effort, View, growth, growth_panels, hair_pixels
+from benchmarks.renderers.cost import Effort, View, growth, growth_panels
 from benchmarks.renderers.path_reference import PathReference
-from benchmarks.renderers.scanlines import measure_scanlines
 from benchmarks.results import Panel, draw_panels, save
 from benchmarks.subjects import Subject, simulated
-from reconstruction import Camera, Light, Progress, Projector, Rig, silent
+from reconstruction import Camera, Light, Progress, Rig, silent
 from reconstruction.arrays import Floats
 from reconstruction.geometry.lights import dome_positions
 
 _JUDGED = 12  # lights whose error is measured
 _STYLES = {"mitsuba path": "k.-", "ours": "C0o-"}
-QUICK = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2, 16)
+QUICK = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2)
 
 
 def run(
@@ -61,12 +60,9 @@ def run(
         }
         save(out / "renderers.json", result)
     subject = next(iter(subjects.values()))
-    progress("growth and scanlines", len(subjects) / (len(subjects) + 1))
+    progress("growth", len(subjects) / (len(subjects) + 1))
     view = View.of(subject, camera, effort.pixels, seed)
     result["growth"] = growth(subject, view, dome(36, seed), effort)
-    projector = Projector.look_at("sweep", 1024, effort.rows, (0.5, -0.9, 0.4), (0, 0, -0.02), 24.0)
-    index = hair_pixels(view.scene, camera, 300, seed)
-    result["scanlines"] = measure_scanlines(view.scene, camera, projector, index, seed=seed)
     save(out / "renderers.json", result)
     draw_panels(out / "renderers.png", _panels(result))
     draw_panels(out / "renderers_growth.png", [growth_panels(result)])

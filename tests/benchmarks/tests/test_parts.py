@@ -1,4 +1,4 @@
-"""What the light-plane benchmark is made of: motion errors, the growth of costs, its captures."""
+"""Motion errors of the light-plane benchmark."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.light_planes.solver_study import compare_solvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -108,18 +107,6 @@ def test_preconditioner_is_symmetric() -> None:
     left, right = float((u * M(v)).sum()), float((v * M(u)).sum())
     assert abs(left - right) < 1e-9 * abs(left) + 1e-9
     assert float((u * M(u)).sum()) > 0
-
-
-def test_every_solver_comes_to_the_same_rest() -> None:
-    A, b = random_problem()
-    curves = compare_solvers(A, b, np.full(b.shape, 0.5), error=1e-6)
-    explicit, plain, multigrid = curves
-    assert explicit.name == "explicit steps"
-    assert all(curve.points[-1][1] < 1e-6 for curve in curves)
-    assert len(multigrid.points) < len(plain.points)
-    for curve in curves:
-        assert curve.points[0][1] == pytest.approx(curves[0].points[0][1])
-        assert (np.diff([seconds for seconds, _ in curve.points]) > 0).all()
 
 
 def test_solver_that_cannot_get_there_says_so() -> None:
