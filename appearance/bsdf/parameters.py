@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from appearance.bsdf.absorption import of_colour, of_melanin
+from appearance.bsdf.absorption import of_melanin
 from appearance.bsdf.far_field import LEAST_BETA_N, FarField
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
@@ -28,8 +28,8 @@ SCALARS = {
 """Name: default, least and greatest value."""
 MITSUBAS_SEGMENTS = 1 << 20
 """Number of segments above which Mitsuba's tangents are those of a place a tenth of a segment off:
-it finds a hit's segment back from one float32 coordinate, in the worst case the next strand's."""
-PIGMENTS = {"eumelanin": (1.3, 0.0, INFINITE), "pheomelanin": (0.2, 0.0, INFINITE)}
+it derives a hit's segment from one float32 coordinate."""
+BROWN = of_melanin(1.3, 0.2)
 
 
 class HairParameters:
@@ -48,10 +48,9 @@ class HairParameters:
                 raise ValueError("extended_hair: give eta or int_ior and ext_ior, not both")
             ratio = _index(props, "int_ior", 1.55) / _index(props, "ext_ior", 1.000277)
             self.values["eta"] = _checked("int_ior/ext_ior", ratio, *SCALARS["eta"][1:])
-        self.values |= _absorption(props)
+        self.values["sigma_a"] = _absorption(props["sigma_a"] if "sigma_a" in props else BROWN)
         if "rotation" in props:
             self.values["rotation"] = _tensor("rotation", props["rotation"], 2, -np.pi, np.pi)
-        self.scale = float(props.get("scale", 1.0))
         self.strands = {name: props[name] for name in NAMES if name in props}
         self.refresh()
         missing = sorted(set(NAMES) - set(self.strands))
@@ -87,17 +86,10 @@ class HairParameters:
 
     def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""
-        beta_n = place.scalar(self.values["azimuthal_roughness"])
-        if "color" in self.values:
-            sigma_a = of_colour(self.values["color"], beta_n)
-        elif "sigma_a" in self.values:
-            sigma_a = self._look_up("sigma_a", mi.Color3f, place)
-        else:
-            sigma_a = mi.Color3f(*of_melanin(*(place.scalar(self.values[n]) for n in PIGMENTS)))
         return Fibre(
-            sigma_a if self.scale == 1 else sigma_a * self.scale,
+            self._look_up("sigma_a", mi.Color3f, place),
             place.scalar(self.values["longitudinal_roughness"]),
-            beta_n,
+            place.scalar(self.values["azimuthal_roughness"]),
             place.scalar(self.values["eta"]),
             -dr.deg2rad(place.scalar(self.values["scale_tilt"])),
         )
@@ -201,22 +193,13 @@ class StrandHit:
         return dr.gather(getattr(mi, kind), self.strands[name], index, self.active)
 
 
-def _absorption(props: Any) -> dict[str, Any]:
-    ways = [n for n in ("sigma_a", "color") if n in props]
-    if ways and (len(ways) > 1 or any(n in props for n in PIGMENTS)):
-        raise ValueError("extended_hair: give one of sigma_a, color, or the two pigments")
-    if not ways:
-        return {name: _scalar(props, name, *limits) for name, limits in PIGMENTS.items()}
-    name, value = ways[0], props[ways[0]]
-    greatest = 1.0 if name == "color" else INFINITE
-    if isinstance(value, mi.TensorXf) and name == "sigma_a":
-        return {name: _tensor(name, value, 3, 0.0, greatest)}
-    if isinstance(value, float):
-        value = [value] * 3
-    if len(value) != 3 or isinstance(value, mi.TensorXf):
-        raise ValueError(f"extended_hair: {name} must be an rgb colour, got {value}")
-    channels = [_checked(name, v, 0.0, greatest) for v in value]
-    return {name: mi.Color3f(*channels)}
+def _absorption(value: Any) -> Any:
+    if isinstance(value, mi.TensorXf):
+        return _tensor("sigma_a", value, 3, 0.0, INFINITE)
+    channels = [value] * 3 if isinstance(value, float) else value
+    if len(channels) != 3:
+        raise ValueError(f"extended_hair: sigma_a must be an rgb colour, got {value}")
+    return mi.Color3f(*(_checked("sigma_a", v, 0.0, INFINITE) for v in channels))
 
 
 def _scalar(props: Any, name: str, default: float, low: float, high: float) -> Any:

@@ -1,7 +1,7 @@
 """The Mitsuba plugin `extended_hair`.
 
 Frame: as on Mitsuba's curves, +y of the shading frame runs along the fibre from root to tip and +z
-is the normal. The names that stock `hair` has too mean the same here.
+is the normal. Names of stock `hair` have the same meaning.
 
 | parameter | type, default | |
 |---|---|---|
@@ -9,12 +9,9 @@ is the normal. The names that stock `hair` has too mean the same here.
 | `scale_tilt` | float or `Float (S,)`, 2 | degrees; Mitsuba's sign: + moves R to the tip, d |
 | `eta`, or `int_ior` and `ext_ior` | float or a material's name | only the ratio counts, d |
 | `sigma_a` | rgb, or `TensorXf` `(S, 3)`, `(n_c, w, h, 3)` | absorption per fibre radius, d |
-| `scale` | float, 1 | factor on the absorption |
-| `eumelanin`, `pheomelanin` | float or `Float (S,)`, 1.3 and 0.2 | instead of `sigma_a`, d |
-| `color` | rgb | Chiang's colour of dense hair, instead of `sigma_a`, d |
 | `rotation` | `TensorXf` `(S, 2)`, `(n_c, w, h, 2)` | correctives: radians about the strand's |
 | | | two transported normals, d |
-| `strand_coordinates.NAMES` | arrays | from `strand_parameters`; needed by whatever varies |
+| `strand_coordinates.NAMES` | arrays | from `strand_parameters`; needed by tables |
 
 S strands; n_c layers from root to tip, linear in between; (w, h) cells of the scalp, of which the
 nearest counts. d: differentiable. A table that is the same everywhere costs no lookup.

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.bsdf.integrals import Case, array_types, fibre, known_direction
 from scipy.spatial.transform import Rotation
 
-from appearance.bsdf import absorption, lobes, reference
+from appearance.bsdf import lobes, reference
 from appearance.bsdf.shading_frame import rodrigues
 
 PARAMETERS = ("sigma_a", "beta_m", "beta_n", "eta", "tilt")
@@ -155,20 +155,3 @@ def test_a_corrective_has_the_gradient_of_the_turned_bsdf():
 
         got, want = forward(function, at), differences(function, at, 1e-4, False)
         assert np.abs(got - want).max() < 1e-6 * np.abs(want).max()
-
-
-def test_pigments_and_colour_are_differentiable_down_to_black():
-    for at in (1e-3, 0.3, 0.999):
-
-        def of_colour(x):
-            return absorption.of_colour(x, 0.3)
-
-        got, want = forward(of_colour, at), differences(of_colour, at, 1e-5 * at, False)
-        assert got == pytest.approx(want, rel=1e-5)
-    for at in (0.0, 1.0):
-        assert np.isfinite(forward(of_colour, at)).all()
-
-    def of_pigment(x):
-        return absorption.of_melanin(x, 0.2)[2]
-
-    assert forward(of_pigment, 1.3) == pytest.approx(1.37)

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from appearance import HairAppearance, build_scene
 from appearance.bsdf import reference
 from appearance.bsdf.lobes import Fibre
-from appearance.bsdf.longitudinal import absorption_of_colour
 from appearance.bsdf.parameters import StrandHit
 from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
@@ -83,8 +82,7 @@ def test_parameters_mean_what_they_mean_in_the_lobes():
         int_ior=1.6,
         ext_ior=1.0,
         scale_tilt=-3.0,
-        sigma_a={"type": "rgb", "value": [0.5, 0.25, 0.0]},
-        scale=2.0,
+        sigma_a={"type": "rgb", "value": [1.0, 0.5, 0.0]},
     )
     wo = reference.direction(np.linspace(-1.4, 1.4, 50), np.linspace(-3, 3, 50))
     si = interaction(case, 50)
@@ -120,20 +118,6 @@ def test_the_stock_plugin_agrees_where_it_is_sound():
         assert got == pytest.approx(want, rel=0.015, abs=1e-4)
 
 
-def test_pigments_and_colour_set_the_absorption():
-    si, wo = interaction(Case(theta_deg=10, h=0.2)), np.array([[0.1, 0.2, 0.9]])
-    wo /= np.linalg.norm(wo)
-    pigments = hair(eumelanin=0.7, pheomelanin=0.3)
-    sigma = 0.7 * np.array([0.419, 0.697, 1.37]) + 0.3 * np.array([0.187, 0.4, 1.05])
-    same = hair(sigma_a={"type": "rgb", "value": list(sigma)})
-    assert evaluate(pigments, si, wo) == pytest.approx(evaluate(same, si, wo), rel=1e-5)
-    colour = [0.8, 0.5, 0.1]
-    chiang = hair(color={"type": "rgb", "value": colour}, azimuthal_roughness=0.4)
-    sigma = absorption_of_colour(colour, 0.4)
-    same = hair(sigma_a={"type": "rgb", "value": list(sigma)}, azimuthal_roughness=0.4)
-    assert evaluate(chiang, si, wo) == pytest.approx(evaluate(same, si, wo), rel=1e-4)
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
@@ -144,7 +128,6 @@ def test_pigments_and_colour_set_the_absorption():
         ({"eta": 1.5, "int_ior": 1.5}, "not both"),
         ({"scale_tilt": 30.0}, "scale_tilt must be"),
         ({"sigma_a": -1.0}, "sigma_a must be"),
-        ({"sigma_a": 1.0, "eumelanin": 0.5}, "one of sigma_a, color"),
         ({"sigma_a": ("tensor", (4, 2))}, r"sigma_a must be a tensor .* got \(4, 2\)"),
         ({"sigma_a": ("tensor", (2, 3, 3, 3))}, "merge strand_parameters"),
         ({"rotation": ("tensor", (2, 3, 3, 3))}, "rotation must be a tensor"),
@@ -237,8 +220,6 @@ def test_every_parameter_may_be_one_per_strand(tuft):
         "azimuthal_roughness": rng.uniform(0.1, 0.9, 60),
         "eta": rng.uniform(1.3, 1.7, 60),
         "scale_tilt": rng.uniform(-4, 4, 60),
-        "eumelanin": rng.uniform(0, 2, 60),
-        "pheomelanin": rng.uniform(0, 2, 60),
     }
     bsdf = hair(**{k: mi.Float(v.astype(np.float32)) for k, v in per_strand.items()}, **curves)
     wo = np.array([[0.48, 0.6, 0.64]])
