@@ -48,7 +48,7 @@ class HairParameters:
                 raise ValueError("extended_hair: give eta or int_ior and ext_ior, not both")
             ratio = _index(props, "int_ior", 1.55) / _index(props, "ext_ior", 1.000277)
             self.values["eta"] = _checked("int_ior/ext_ior", ratio, *SCALARS["eta"][1:])
-        self.values["sigma_a"] = _absorption(props["sigma_a"] if "sigma_a" in props else BROWN)
+        self.values["sigma_a"] = _absorption(props.get("sigma_a", BROWN))
         if "rotation" in props:
             self.values["rotation"] = _tensor("rotation", props["rotation"], 2, -np.pi, np.pi)
         self.strands = {name: props[name] for name in NAMES if name in props}
