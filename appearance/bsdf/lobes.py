@@ -1,10 +1,9 @@
 """The hair BSDF in Dr.Jit: R, TT, TRT and the residual lobe, near field, in stable forms.
 
-The same symbols and conventions as `appearance.bsdf.reference`, which says what each one is. Every
-function takes Python floats, float32 or float64 Dr.Jit arrays of any back end, and is
-differentiable in all its arguments. Nothing here knows a scene.
+Symbols and conventions are those of `appearance.bsdf.reference`. Every function takes Python
+floats, float32 or float64 Dr.Jit arrays of any back end, and is differentiable in all arguments.
 
-Where the printed forms cancel, these do not:
+Forms without the cancellation of the printed ones:
 - cos(theta) is the length of the direction's part across the fibre, not sqrt(1 - sin²): float32
   directions resolve the narrowest lobe up to the fibre's axis;
 - M's exponent (c - s - 1)/v is -|chord|²/(2v), the chord from the mirror direction;
@@ -51,7 +50,7 @@ class Fibre:
 
 @dataclass(frozen=True)
 class Known:
-    """What follows from a fibre and the known direction `wi` alone, for all lobes.
+    """Quantities of a fibre and the known direction `wi`, for all lobes.
 
     `sine`, `cosine` of the tilted inclination, `v` and `attenuation` A_p are one per lobe;
     `choice` the probabilities of sampling each, summing to 1; `turn` is gamma_o + gamma_i in the
@@ -96,7 +95,7 @@ def azimuth(w: Any) -> Any:
 
 
 def tilted(sine: Any, cosine: Any, tilt: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Sines and cosines of the inclination that each lobe sees, folded into [-pi/2, pi/2]."""
+    """Sines and cosines of each lobe's tilted inclination, folded into [-pi/2, pi/2]."""
     s1, c1 = dr.sin(tilt), dr.cos(tilt)
     s2, c2 = 2 * s1 * c1, c1 * c1 - s1 * s1
     s4, c4 = 2 * s2 * c2, c2 * c2 - s2 * s2

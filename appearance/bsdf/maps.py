@@ -59,7 +59,7 @@ class HairMaps:
 
     @property
     def uniform(self) -> bool:
-        """Whether they are of one cell and turn no fibre: one material for all hair."""
+        """Whether they have one cell and no rotation: one material for all hair."""
         return self.shape == (1, 1, 1) and not self.rotation.any()
 
     def mean(self) -> HairAppearance:
@@ -88,10 +88,7 @@ class HairMaps:
 
     @classmethod
     def load(cls, model: Model) -> tuple[HairMaps, Array]:
-        """The maps that `save` wrote, and `root_uv (S, 2)`.
-
-        Raises `ModelError` where there are none, or other things.
-        """
+        """The saved maps, and `root_uv (S, 2)`. Raises `ModelError` for a missing or bad file."""
         data = model.arrays("hair_maps.npz")
         try:
             scalars = [float(x) for x in data["scalars"]]
@@ -180,10 +177,9 @@ def scalp_coordinates(strands: Strands, head: Mesh | None) -> Array:
 
 
 def root_normals(strands: Strands) -> Array:
-    """Unit directions `(S, 3)` from the middle of the sphere through the roots: they turn with it.
+    """Unit directions `(S, 3)` from the middle of the roots' sphere through the roots.
 
-    Start of the strands' transported normals, for which any direction that moves with the head
-    serves.
+    Start of the strands' transported normals; they move with the head.
     """
     roots = strands.roots.astype(float)
     middle = roots.mean(axis=0)

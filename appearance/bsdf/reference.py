@@ -53,7 +53,7 @@ def logistic_scale(beta_n: ArrayLike) -> Array:
 
 
 def tilted(p: int, theta: ArrayLike, tilt: ArrayLike) -> Array:
-    """theta, of any shape, that lobe `p` sees under a cuticle tilt, folded into [-pi/2, pi/2]."""
+    """theta, of any shape, of lobe `p` under a cuticle tilt, folded into [-pi/2, pi/2]."""
     turned = np.asarray(theta, float) + (2, -1, -4, 0)[p] * np.asarray(tilt, float)
     return np.arcsin(np.sin(turned))
 

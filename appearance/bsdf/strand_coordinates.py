@@ -1,8 +1,7 @@
-"""Where on the scalp and along its strand a hit lies, from the index of the segment that was hit.
+"""A hit's place on the scalp and along its strand, from the index of the hit segment.
 
-Mitsuba's own coordinate along all curves is one float32: with a few million segments it is off by a
-whole segment. The segment's index is an integer, and the place within the segment follows from the
-hit point and the segment's four control points.
+Mitsuba's coordinate along all curves is one float32, a whole segment off for a few million. The
+place within the segment is computed from the hit point and the segment's four control points.
 """
 
 from __future__ import annotations

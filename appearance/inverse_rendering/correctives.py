@@ -25,12 +25,12 @@ from reconstruction.arrays import Array, Ints
 WIDTH = 0.2
 """Prior standard deviation of a corrective, radians."""
 PRIOR_WEIGHT = 1e-3
-"""Of half the mean squared corrective, in widths, beside the image loss."""
+"""Weight of half the mean squared corrective, in widths."""
 _TURNS, _ITERATIONS = 2, 30
 _APART = 4
 """Every so many lights are validation lights."""
 _SHARES = (2.0, 1.0, 0.5)
-"""Noise in the derivatives makes steps too short."""
+"""Step sizes; noise in the derivatives makes steps too short."""
 _ALIKE = 1e-4
 """Squared radians below which layers count as alike."""
 

@@ -33,22 +33,22 @@ WIDE = {"sigma_a": 0.4, "beta_m": 0.4, "beta_n": 0.6, "eta": 0.6, "gain": PRIOR}
 """The unit of steps, in those of `Raw`."""
 _FARTHEST = 1.5
 _TURNS, _ESTIMATES = 16, 4
-"""Most draws of paths; the result is the mean of so many estimates within a width of each other."""
+"""Most draws of paths; the result is the mean of `_ESTIMATES` within a width of each other."""
 _DARKENS, _CLEARLY = 32, 0.25
 """Most steps of absorption alone, and the width from which they count."""
 FEWEST = 32
 """Paths a pixel of a draw."""
 _BEGINS = (-1.8, 0.4)
-"""Roughness begins between 0.15 and 0.6: a much narrower lobe is met by too few paths."""
+"""Roughness starts between 0.15 and 0.6: too few paths sample a much narrower lobe."""
 _ALIKE = 3 * 32
-"""Values in a row that may be off together."""
+"""Successive values with correlated errors."""
 FOUND = {"beta_m": (0.05, 0.8), "beta_n": (0.2, 0.7)}
 """Roughness recovered from any start in tests; a result outside these ranges is doubtful."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The images that a solve uses: `pairs`, pixels and paths, and a seed."""
+    """The images of a solve: `pairs`, pixels and paths, and a seed."""
 
     pairs: Sequence[Batch]
     effort: Effort
@@ -58,8 +58,8 @@ class Evidence:
 class Solved(NamedTuple):
     """The solution: `raw` and `gain (L,)`.
 
-    `left_open`: by name, the standard error of an estimate over the width of `WIDE` that it begins
-    with, of the least certain channel; 1 is a flat response: images do not depend on it.
+    `left_open`: by name, the standard error of an estimate over its prior width in `WIDE`, of the
+    least certain channel; 1 if images do not depend on it.
     """
 
     raw: Raw
@@ -77,15 +77,12 @@ def solve_global_parameters(
 ) -> Solved:
     """`raw` and `gain (L,)` with the numbers called `names` solved for.
 
-    "sigma_a" moves all cells' logits alike in each channel; "gain" is the intensities of the pairs'
-    lights, their mean kept at 1. What no pixel of the pairs depends on stays where it is: every
-    estimate has a prior of the widths of `WIDE`, gains one of 3 % about the calibration. Roughness
-    is found within `FOUND`; a narrower beta_n ends at up to 0.3. Hair that begins too bright in all
-    channels is darkened before anything else moves: a wide lobe would explain its picture as well.
-    (Black hair from a grey start: beta_m within 10 %, its index off by up to 0.15; with the index
-    held, beta_m 0.31 to 0.40 for 0.25.)
-    Takes the time of five to sixteen pictures of twice `effort.spp` paths a pixel. Where a picture
-    is not finite, the input is returned.
+    "sigma_a" shifts all cells' logits of a channel; "gain" is the intensities of the pairs' lights,
+    with mean 1. Estimates have priors of the widths in `WIDE`, gains of 3 % about the calibration.
+    Roughness is recovered within `FOUND`; a narrower beta_n results in up to 0.3. Hair that starts
+    too bright in all channels is darkened first, as a wide lobe would explain its image too. Takes
+    the time of five to sixteen images of twice `effort.spp` paths a pixel. Returns the input if an
+    image is not finite.
     """
     lights = np.unique(np.concatenate([b.lights for b in evidence.pairs]))
     numbers = [
@@ -127,7 +124,7 @@ def solve_global_parameters(
 
 
 def _darkened(problem: FitProblem, raw: Raw, gain: Array, evidence: Evidence) -> Raw:
-    """`raw` with its absorption moved, alone, while each channel is clearly too bright."""
+    """`raw` with more absorption, while each channel is clearly too bright."""
     numbers = [("sigma_a", i) for i in range(3)]
     system = _System(problem, numbers, replace(evidence, seed=evidence.seed + 1))
     for turn in range(_DARKENS):
@@ -234,7 +231,7 @@ class _System:
 
 
 def _changes(raw: Raw, number: Number) -> dict[str, Any]:
-    """By how much a number's width changes the renderer's value, to first order."""
+    """First-order change of the renderer's value by a number's width."""
     name, i = number
     slope = derivatives(raw)[name]
     if name != "sigma_a":

@@ -1,8 +1,7 @@
 """A first absorption for each group of strands: Sun's Algorithm 1 for every cell of the volume.
 
-Each cell's colour C is scaled by how much brighter the captured pixels that show the cell are than
-the rendered ones. It takes pictures only, no gradients, and a cell's noise is that of a mean over
-its pixels and lights: a few rounds bring what many noisy steps would.
+Each cell's colour C is scaled by the ratio of captured to rendered brightness of its pixels, a mean
+over many pixels and lights with little noise. No gradients are needed.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from reconstruction.arrays import Array, Ints
 Shape = tuple[int, int, int]
 _RAYS = 8
 _PATHS = 100_000
-"""Of a round, over all views: the more pixels show a cell, the fewer paths each of them needs."""
+"""Paths of a round, over all views."""
 _WIDE = 0.02
-"""Weight of a cell's far neighbours, which alone determine a cell that no ray hits."""
+"""Weight of a cell's far neighbours, which determine a cell without hits."""
 
 
 def absorption_of_cells(
@@ -44,11 +43,9 @@ def absorption_of_cells(
 ) -> HairMaps:
     """The maps of `raw` with each cell's absorption scaled to its captured colour; `gain (L,)`.
 
-    The first `whole` rounds take the whole step, those after them a half, a third and so on: the
-    mean of their estimates, as each of them has its own noise (Robbins and Monro 1951).
-    The light is the mean of the valid single lights of each pixel. A round costs what 100,000 paths
-    do, however many pixels and lights there are: at most a quarter of `effort`'s paths a pixel,
-    at least one.
+    The first `whole` rounds take the full step, later ones a half, a third and so on (Robbins and
+    Monro 1951). The light is the mean of the valid single lights of each pixel. A round traces
+    100,000 paths: at most a quarter of `effort`'s paths a pixel, at least one.
     """
     pixels = sum(len(o.pixels) for o in problem.views)
     spp = int(np.clip(_PATHS // max(pixels, 1), 1, max(1, effort.spp // 4)))

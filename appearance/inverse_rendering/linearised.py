@@ -51,8 +51,8 @@ class Cells:
         return np.asarray(flat[self.low] * (1 - share) + flat[self.low + self.stride] * share)
 
     def gathered(self, values: Array, vertex: Ints, size: int) -> Array:
-        """The sums `(size, c)` of what `values (N, c)` at the numbers `vertex (N,)` give cells: the
-        transpose of `look_up`."""
+        """The transpose of `look_up`: sums `(size, c)` over cells of `values (N, c)` at vertices
+        `(N,)`."""
         low, share = self.low[vertex], self.share[vertex, None]
         parts = ((low, values * (1 - share)), (low + self.stride, values * share))
         return np.asarray(
@@ -100,8 +100,7 @@ class LinearisedPictures:
         """Their derivative along `moved`: changes of sigma_a `(n_c, w, h, 3)`, of rotation
         `(n_c, w, h, 2)` and of scalars.
 
-        On `first_hit`, of the light alone that the first vertex of a path gets and how it scatters
-        it: hardly noisy.
+        With `first_hit`, only of the first vertex's direct light, with little noise.
         """
         lit = self._logarithms(moved, self._paths.lit, self._lit)
         if first_hit:
@@ -135,7 +134,7 @@ class LinearisedPictures:
         return total
 
     def _along(self, values: AnyFloats, combine: Any, first: float) -> Array:
-        """What the rows of `onward` make together up to each vertex `(V, 3)`."""
+        """Sums over the rows of `onward` up to each vertex `(V, 3)`."""
         starts = self._paths.starts
         out = np.full((starts[-1], 3), first)
         for begin, end in pairwise(starts[1:]):

@@ -1,4 +1,4 @@
-"""The fit of a variant: its solvers one after the other, and the judgement of what they found."""
+"""The fit of a variant: its solvers in sequence, and the validation of their result."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ VARIANTS: dict[Variant, tuple[tuple[str, ...], bool]] = {
     "correctives": ((*COLOUR, "rotation"), True),
     "lights": ((*COLOUR, "rotation", "gain"), True),
 }
-"""The ablations: what may be free, and whether colour and correctives vary over the volume."""
+"""The ablations: free parameters, and whether colour and correctives vary over the volume."""
 VALIDATION_VIEWS, VALIDATION_LIGHTS = 3, 8
-"""Views, and lights of each, whose frames the numbers that all hair shares are found from."""
+"""Views, and lights of each, for the global parameters."""
 _ALTERNATIONS = 2
-"""Of global parameters and cells, each of which depends on the other."""
+"""Alternations of global parameters and cells."""
 _MORE_ROUNDS = 6
 SURE, _DRAWS = 0.975, 2000
-"""How often a result's full images must be better than the start's, and draws of their parts."""
+"""Least share of bootstrap draws in which a result is better than the start, and draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +53,14 @@ class Refused:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of a fit, and how it ended.
+    """The result of a fit, and its end.
 
     `gain (L,)` are factors on the lights' intensities. `ended` is "converged", what was kept of the
     start, or why there was nothing to fit; `start_error` and `error` are those of full images of
-    all pairs, at the start and at the result, under fresh random numbers and alike for both
-    (`FitProblem.full_image_errors`). `sure` is the share of random draws of the parts of the hair
-    in which the best result is better than the start (bootstrap): below `SURE`, maps and gain are
-    the start's, and `refused` is the result. `history` holds (seconds, validation error).
-    `left_open`: see `global_parameters.Solved`; empty where no number was solved for.
+    all pairs, under the same new random numbers (`FitProblem.full_image_errors`). `sure` is the
+    share of bootstrap draws of parts of the hair in which the result is better than the start:
+    below `SURE`, maps and gain are the start's, and `refused` is the result. `history` holds
+    (seconds, validation error). `left_open`: see `global_parameters.Solved`.
     """
 
     maps: HairMaps
@@ -77,10 +76,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Monitor:
-    """Receives the progress of a fit, and names the file in which it saves its state.
+    """Progress callback and checkpoint file of a fit.
 
-    With a `checkpoint` file, a fit that was killed resumes after the last solver that ended; a file
-    of other data or options is replaced. The file stays: whoever starts the fit removes it.
+    With a `checkpoint`, a killed fit resumes after its last complete solver; a file of other data
+    or options is replaced. The caller removes the file.
     """
 
     progress: Progress = silent
@@ -194,12 +193,13 @@ class _Fit:
         state.pieces = number + 1
 
     def _is_taken(self, number: int, error: float, before: float) -> bool:
-        """The first of its kind is; a repeated one, and correctives, if the error is lower."""
+        """Whether its result is used: the first of its kind always; a repeated one, and
+        correctives, if the error is lower."""
         what, *others = (name for name, _ in self._pieces[number::-1])
         return error < before or not (what == "correctives" or what in others)
 
     def _error_so_far(self, number: int) -> float:
-        """The error of what was taken of the start and the first `number` solvers."""
+        """The error of the state after the first `number` solvers."""
         taken, *errors = (error for _, error in self.history[: number + 1])
         for k, error in enumerate(errors):
             taken = error if self._is_taken(k, error, taken) else taken
@@ -233,7 +233,7 @@ class _Fit:
 
     @cached_property
     def _fingerprint(self) -> str:
-        """Of everything that the course of a fit depends on."""
+        """A hash of the fit's input."""
         pieces = [what for what, _ in self._pieces]
         course = (self.options, self.seed, self.problem.scale, pieces)
         total = hashlib.sha256(repr(course).encode())
@@ -252,7 +252,7 @@ class _Fit:
         return self.problem.validation(start, self.gain, self.spread, effort, self.seed << 16)
 
     def _judged(self, state: State) -> Outcome:
-        """The best of the result and of what it came from, by fresh random numbers."""
+        """The best of the result and its start, under new random numbers."""
         seed, ended = (self.seed << 16) + (1 << 24), "converged"
         guesses = [(state.raw, state.gain, ended)]
         if (state.gain != self.gain).any():
@@ -276,7 +276,7 @@ class _Fit:
 
 
 def _sure(parts: Array) -> float:
-    """In which share of draws, with replacement, the sum of `parts (B,)` is positive."""
+    """Share of bootstrap draws in which the sum of `parts (B,)` is positive."""
     rng, count = np.random.default_rng(0), len(parts)
     drawn = rng.multinomial(count, np.full(count, 1 / count), _DRAWS)
     return float((drawn @ parts > 0).mean())

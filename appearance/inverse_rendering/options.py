@@ -41,11 +41,10 @@ class InverseRenderingRequest:
     """The options of a job.
 
     Of the training lights `lights` are fitted and `validation_lights` decide whether the result is
-    rendered (see `fit_validated`). `hair_pixels` a camera are fitted, one colour before the volume.
-    `max_depth` is the number of vertices a path may have; None measures the depth that is needed.
-    Held-out images are judged with `judged_spp` paths a pixel. `fit` is how the fit is run. The
-    defaults are what a minute buys, the numbers that all hair shares: maps (variants from "spatial"
-    on) want 24 lights, 4,000 pixels, and an `Effort` of 600 pixels and 128 paths.
+    rendered (see `fit_validated`). `hair_pixels` a camera are fitted. `max_depth` is the largest
+    number of vertices; None measures it. Held-out images have `judged_spp` paths a pixel. The
+    defaults take a minute and are for the global parameters: maps (variants from "spatial" on) need
+    24 lights, 4,000 pixels, and an `Effort` of 600 pixels and 128 paths.
     """
 
     lights: Count = 12

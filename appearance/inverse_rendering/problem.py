@@ -94,12 +94,11 @@ class FitProblem:
     def full_image_errors(
         self, guesses: Sequence[tuple[Raw, Array]], used: Bools, effort: Effort, seed: int
     ) -> Array:
-        """The errors of full images over parts of the hair, of each guess `(G, B)`.
+        """The errors of full images by part of the hair, of each guess `(G, B)`.
 
-        Their mean over B is the weighted mean squared difference, noise taken off, of all hair
-        pixels of the pairs `used (V, L)`. All guesses have the same weights, at the middle of what
-        was captured and what they render. A part is a ninth of a view's pixels under all its
-        lights: other parts have other paths.
+        Their mean over B is the weighted mean squared difference, without noise, of all hair pixels
+        of the pairs `used (V, L)`, with the same weights for all guesses. A part is a ninth of a
+        view's pixels under all its lights, with own paths.
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
         paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))

@@ -42,21 +42,18 @@ _USUAL = 0.99  # quantile of the pilot's pixels beyond which a path is a rare br
 
 @options
 class OlatOptions:
-    """How `render_olat` spends its time.
+    """Sampling of `render_olat`, unbiased for every choice.
 
-    `spp` paths a pixel serve all lights. `max_depth` is the number of vertices a path may have (1
-    is direct light); None measures what is needed, see `bounce_limit`.
+    `spp` paths a pixel are shared by all lights. `max_depth` is the largest number of vertices (1
+    is direct light); None measures it, see `bounce_limit`.
 
-    Every vertex weighs all lights, or a systematic sample of `first_lights` at the first vertex
-    and `deep_lights` at later ones, weighted by L/k: worse for images of single lights, better for
-    their sum. A contribution below `thrift` times the standard deviation of what a path brings
-    from that light (from a pilot pass) casts its shadow ray by roulette; 0 casts all of them. A
-    shadow ray takes as long as the BSDF of twenty lights: 3 halves the time and more for 5 to 10 %
-    more variance on hair, where 2 to 8 do as well within a tenth. The estimate is unbiased for
-    every choice of these numbers.
+    Every vertex gathers all lights, or a systematic sample of `first_lights` at the first vertex
+    and `deep_lights` at later ones: worse for images of single lights, better for their sum. A
+    contribution below `thrift` times its standard deviation over paths (from a pilot pass) casts
+    its shadow ray by roulette; 0 casts all. 3 halves the time or better for 5 to 10 % more variance
+    on hair; 2 to 8 are within a tenth of it.
 
-    `memory` bounds, in bytes, what the tiles of pixels take at a time; the images that
-    `render_olat` returns come on top.
+    `memory` bounds the bytes of the tiles of pixels, without the returned images.
     """
 
     spp: Count = 32
@@ -78,10 +75,9 @@ def render_olat(
 ) -> Floats:
     """Radiance under each of `lights` alone, W/(sr m²) at full level.
 
-    Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`: then
-    a cheap pass finds the pixels that see the subject and only those are traced. `options`: see
-    `OlatOptions`. Same arguments, same bytes, with any number of threads.
-    Raises `ValueError` for options out of range, `FloatingPointError` where light is not finite.
+    Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`.
+    `options`: see `OlatOptions`. Same arguments, same bytes, with any number of threads. Raises
+    `ValueError` for options out of range, `FloatingPointError` for infinite light.
     """
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
     out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed)
@@ -117,7 +113,7 @@ def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
 
 
 class _View(NamedTuple):
-    """What is rendered: the flat `pixels (P,)` of a camera under each of the lights."""
+    """The flat `pixels (P,)` of a camera under each of the lights."""
 
     scene: HairScene
     camera: Camera
@@ -149,7 +145,7 @@ def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = Fal
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is rendered, and how paths and shadow rays are spent.
+    """The input of a rendering, and its sampling.
 
     `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
     this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the
@@ -176,10 +172,9 @@ class _Plan:
         return np.asarray(image / np.float32(spp), dtype=np.float32)
 
     def spread(self, index: Ints, spp: int, seed: int) -> Floats:
-        """Standard deviation `(L,)` of what a path through a pixel brings from each light.
+        """Standard deviation `(L,)` of a path's contribution from each light.
 
-        From a few paths, and without the brightest of them: a rare bright path, a hundred times
-        what all others bring, is no measure for these.
+        From a few paths, without the brightest of them, which would dominate.
         """
         wanted = int(np.clip(len(index) * spp // _PILOT_SHARE, 64, _PILOT))
         few = index[:: -(-len(index) // wanted)]

@@ -24,9 +24,7 @@ _SQUARE = 1e-3
 def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
     """Mitsuba rays through the image points `u`, `v` (Dr.Jit floats), in scene units.
 
-    `u`, `v` are in the renderers' convention, where the top-left pixel covers [0, 1) x [0, 1):
-    this is the one place that takes off the half pixel to `Camera`'s convention, where that
-    pixel's centre is (0, 0).
+    The top-left pixel covers [0, 1) x [0, 1) here; in `Camera`'s convention its centre is (0, 0).
     """
     k = opaque([camera.K[0, 0], camera.K[0, 1], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2]])
     y = (v - 0.5 - k[4]) / k[3]
@@ -50,8 +48,8 @@ class Surface:
     def interact(self, ray: Any, active: Any) -> Any:
         """The first `SurfaceInteraction3f` along `ray`.
 
-        Around a fibre exactly along z Mitsuba's `dp_du` points along the normal here and there, and
-        the shading frame made of it is none: such a frame is made of `dp_dv` instead.
+        Around a fibre exactly along z Mitsuba's `dp_du` may be parallel to the normal; the shading
+        frame is then made of `dp_dv`.
         """
         si = self.scene.mi_scene.ray_intersect(ray, active)
         if self.scene.hair_shape is None:
@@ -112,11 +110,10 @@ class Surface:
 
 @dataclass(frozen=True)
 class PointSource:
-    """A point to cast a shadow ray at, its intensity, and the contribution below which one is rare.
+    """A point to cast a shadow ray at, and its intensity.
 
-    A contribution below `dim` casts its shadow ray only with probability contribution/`dim` and
-    then counts as `dim`: the mean stays, and shadow rays, which cost ten times what the BSDF does,
-    go where the light is.
+    A contribution below `dim` casts its shadow ray with probability contribution/`dim` and then
+    counts as `dim`.
     """
 
     position: Any
@@ -164,10 +161,10 @@ def stream(size: int, *seeds: int) -> Any:
 
 
 def stream_of(state: Any, lane: Any) -> Any:
-    """The random stream of a `lane`, a `UInt64`; `state` is what `seed_state` returns.
+    """The random stream of a `lane`, a `UInt64`; `state` is the result of `seed_state`.
 
-    Each begins at a hash of the two: PCG32 streams whose states differ by a fixed step draw numbers
-    that go together, and the noise of two pixels so many lanes apart correlates by up to 0.4.
+    Each begins at a hash of the two: PCG32 streams with states a fixed step apart correlate by up
+    to 0.4.
     """
     low, high = mi.UInt32(lane) ^ mi.UInt32(state), mi.UInt32(lane >> 32) ^ mi.UInt32(state >> 32)
     hashed: Any = mi.sample_tea_64  # nor do the stubs take Dr.Jit's plain integers
@@ -238,9 +235,8 @@ def each_sample(
 ) -> None:
     """Call `trace` with samples 0 to `spp` of each of the `slots` Dr.Jit `pixels`, one at a time.
 
-    A loop inside the kernel: all samples of a pixel are one thread's, in order. Films are sums of
-    floats, and the same bytes on every run need the same order. `trace` is called once, with
-    symbolic variables.
+    A loop inside the kernel, so that the order of a pixel's floating-point sums, and so the bytes,
+    are the same on every run. `trace` is called once, with symbolic variables.
     """
     slot = dr.arange(mi.UInt32, slots)
     size, end = opaque_index(slots), opaque_index(spp)

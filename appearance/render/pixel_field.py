@@ -1,4 +1,4 @@
-"""What a field of reflectance does to the light that single pixels send to the camera."""
+"""A field of reflectance at single pixels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PixelField:
         return int(np.sqrt(self.coefficients.shape[1])) - 1
 
     def lit(self, radiance: Floats, lights: Sequence[Light]) -> Floats:
-        """`radiance (L, P, 3)` under each of `lights` alone, as the field has it."""
+        """`radiance (L, P, 3)` under each of `lights` alone, with the field."""
         fields = self.coefficients.shape[2] // 3
         out = np.repeat(radiance, fields, axis=-1)
         for i, light in enumerate(lights):
@@ -78,10 +78,8 @@ class PixelField:
         return total.astype(np.float32)
 
     def mean_factor(self, integrals: AnyFloats) -> Floats:
-        """About what an environment's light is multiplied by, in the mean: `(P, 3)`, at least 0.1.
-
-        `integrals (n, 3)`, of which the first is the map's light.
-        """
+        """Approximate mean factor on an environment's light: `(P, 3)`, at least 0.1; `integrals
+        (n, 3)` are the map's with the harmonics."""
         first = np.maximum(integrals[0], 1e-30)
         mean = integrals / first * harmonics((0, 0, 1.0), 0)
         return np.maximum(1 + np.einsum("nc,pnc->pc", mean, self.coefficients), 0.1)
@@ -118,5 +116,5 @@ def field_of(scene: HairScene, camera: Camera, pixels: Ints) -> PixelField | Non
 
 
 def factor_of(field: PixelField | None) -> DeviceField | None:
-    """The factors of a modulation; None of what multiplies nothing."""
+    """The factors of a modulation; None for other fields."""
     return None if field is None or field.additive else DeviceField(field)

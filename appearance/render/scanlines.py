@@ -37,11 +37,8 @@ _REACH = 4.0  # standard deviations of the line's blur beyond which a row is ski
 
 @options
 class ScanlineOptions:
-    """How `render_scanlines` spends its time.
-
-    `spp` paths a pixel serve all rows. `max_depth`, `thrift` and `memory` are as in `OlatOptions`;
-    here a path costs more than its shadow rays, and fewer of them are spared.
-    """
+    """Sampling of `render_scanlines`: `spp` paths a pixel for all rows; the rest as in
+    `OlatOptions`."""
 
     spp: Count = 16
     max_depth: Count | None = None
@@ -118,7 +115,7 @@ def _rows(projector: Projector, rows: range | None) -> range:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is swept, and how paths and shadow rays are spent; `dim` as in `PointSource`."""
+    """The input of a sweep, and its sampling; `dim` as in `PointSource`."""
 
     scene: HairScene
     camera: Camera

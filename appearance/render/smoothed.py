@@ -1,10 +1,8 @@
-"""Pictures to be shown: light from the first hit as it is, the rest smoothed.
+"""Images with smoothed indirect light.
 
-Light that a fibre sends on from another fibre has been spread by every hit before it: it varies
-slowly over the image and carries nearly all of the noise. It is averaged over a Gaussian, hair and
-head apart, each by its share of the pixels, so that nothing leaks over an edge. Direct light, with
-the strands' highlights and shadows, is left as it is. The renderers without smoothing are the
-unbiased reference; what differs is noise there and bias of the smoothing here.
+Indirect light varies slowly over the image and has nearly all of the noise. It is filtered by a
+Gaussian, separately for hair and head, each by its share of the pixels. Direct light, with
+highlights and shadows, is not filtered. The renderers without smoothing are the unbiased reference.
 """
 
 from __future__ import annotations
@@ -88,9 +86,9 @@ def environment_smoothed(
 ) -> Floats:
     """`render_environment` with its indirect light smoothed: `(H, W, 3)`.
 
-    `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, of large pictures over 1/160 of their width.
-    Direct light takes `_DIRECT_OF_MAPS` times `spp` paths a pixel: they are short, and the strands
-    show in it. What only one half of them sampled is spread (`without_rare`).
+    `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, or 1/160 of the width of large images. Direct
+    light has `_DIRECT_OF_MAPS` times `spp` paths a pixel; light that only one half of them sampled
+    is spread (`without_rare`).
     """
     spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
@@ -108,7 +106,7 @@ def environment_smoothed(
 
 
 def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
-    """About what the scene's field multiplies an environment's light by `(H, W, 3)`."""
+    """Approximate factor of the scene's field on an environment's light `(H, W, 3)`."""
     out = np.ones((camera.height, camera.width, 3), np.float32)
     index = covered_pixels(scene, camera)
     field = field_of(scene, camera, index)
@@ -119,10 +117,10 @@ def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
 
 
 def without_rare(one: Floats, other: Floats, share: dict[str, Floats], sigma: float) -> Floats:
-    """The mean of two independent pictures `(H, W, 3)` of one thing, without rare bright paths.
+    """The mean of two independent images `(H, W, 3)`, without rare bright paths.
 
-    What a pixel of one has above all nine neighbours of the other is a rare path's: a glint along a
-    strand is in both. It is spread over `sigma` pixels (see `smoothed`), so that the sum is kept.
+    The excess of a pixel over all nine neighbours in the other image is a rare path's, and spread
+    over `sigma` pixels (see `smoothed`), which keeps the sum.
     """
     highest_one, highest_other = (maximum_filter(x, (3, 3, 1)) for x in (one, other))
     usual = 0.5 * (np.minimum(one, highest_other) + np.minimum(other, highest_one))
@@ -132,10 +130,9 @@ def without_rare(one: Floats, other: Floats, share: dict[str, Floats], sigma: fl
 def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
     """`images (L, H, W, 3)` averaged over `sigma` pixels, hair and head apart.
 
-    `share` is what `coverage` returns. A pixel belongs to what covers more of it, and gets the
-    local mean of that, by area, times its own share of it. Where a pixel has over twice the mean
-    over 4 `sigma`, a rare path has hit it: the excess is averaged over 4 `sigma`, so that the
-    sum is kept and no blot is left. Raises `ValueError` for `sigma` <= 0.
+    `share` is the result of `coverage`. A pixel belongs to what covers more of it, and gets the
+    local mean of that, by area, times its own share. The excess over twice the mean over 4 `sigma`
+    is averaged over 4 `sigma`. Raises `ValueError` for `sigma` <= 0.
     """
     if not sigma > 0:
         raise ValueError(f"sigma must be positive, got {sigma}")
@@ -154,7 +151,7 @@ def smoothed(images: Floats, share: dict[str, Floats], sigma: float) -> Floats:
 
 
 def _without_blots(light: Floats, weight: Floats, sigma: float) -> Floats:
-    """The local mean of `light (L, H, W, 3)`, and of what is rare over a wider window."""
+    """The local mean of `light (L, H, W, 3)`, with rare light over a wider window."""
     peak = light.max(axis=-1, keepdims=True)
     usual = light * np.minimum(
         1.0, _RARE * _local_mean(peak, weight, _WIDE * sigma) / np.maximum(peak, 1e-30)

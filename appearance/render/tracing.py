@@ -1,4 +1,4 @@
-"""One loop that follows all camera paths: a lane whose path ends begins its next at once."""
+"""One loop over all camera paths: a lane whose path ends begins its next."""
 
 from __future__ import annotations
 
@@ -89,11 +89,10 @@ def follow(
 ) -> None:
     """Follow `plan.spp` paths through each of the flat `pixels (P,)`.
 
-    `vertex(si, paths)` is called where paths meet the subject and `escape(ray, paths)` where their
-    rays miss it; both are traced once, with symbolic variables, and add to their films as a side
-    effect. All samples of a pixel are one lane's, in order, so that sums of floats are the same on
-    every run and no two lanes write to one slot. Lanes do not wait for each other's longest path:
-    that saves a fifth to a third of the time.
+    `vertex(si, paths)` is called at hits and `escape(ray, paths)` for rays that miss the subject;
+    both are traced once, with symbolic variables, and add to films. All samples of a pixel are one
+    lane's, in order, so that sums are the same on every run. Lanes do not wait for each other's
+    longest path, which saves a fifth to a third of the time.
     """
     spp, limits = plan.spp, plan.limits
     slot = dr.arange(mi.UInt32, len(pixels))
@@ -143,7 +142,7 @@ def follow(
 
 
 def add_light(film: Any, value: Any, first: Any, active: Any, stride: Any = 1) -> None:
-    """Add the channels of `value` at `first`, `first + stride`, …: places of one lane alone."""
+    """Add the channels of `value` at `first`, `first + stride`, …, which no other lane writes."""
     for channel in range(3):
         put = first + channel * stride
         dr.scatter_add(film, value[channel], put, active, mode=dr.ReduceMode.NoConflicts)
