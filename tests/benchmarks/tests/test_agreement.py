@@ -44,20 +44,7 @@ def test_noise_is_not_correlated(views):
     assert (beyond < 4).all()
 
 
-<<<<<<< HEAD
-def test_one_run_has_no_standard_error(tmp_path):
-    with pytest.raises(ValueError, match="at least two seeds"):
-        agreement(tmp_path, tmp_path, seeds=1)
-
-
-def test_a_folder_without_its_truth_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"params\.json"):
-        agreement(tmp_path, tmp_path)
-
-
 @pytest.mark.slow
-=======
->>>>>>> 14ffbca1 (Remove benchmarks without a published page, and tests of benchmarks)
 def test_agrees_with_blender_cycles_and_with_mitsuba(shared_data, tmp_path):
     folder = shared_data("captures/cycles_wavy")
     result = agreement(tmp_path, folder, cameras=(4,), lights=(6, 9), seeds=2, spp=8)
