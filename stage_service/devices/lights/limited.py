@@ -226,8 +226,11 @@ class LimitedLightBank:
         limits, on = self._limits, now - self._since.get(lamp, now)
         if on >= limits.max_on_s:
             expected = f"at most {limits.max_on_s:g} s (max_on_s in [safety])"
-            todo = "It was put off. Shorten the exposure; a slow device also keeps a lamp lit."
-            return self._error(doing, expected, f"lit for {on:.3g} s", todo)
+            todo = (
+                "It was put off. Shorten the exposure; a slow device, or a service that "
+                "stood still, also puts it off late."
+            )
+            return self._error(doing, expected, f"commanded on for {on:.3g} s", todo)
         return self._too_much(doing, self._used(lamp, now))
 
     def _too_much(self, doing: str, used: float) -> SafetyRefusal:

@@ -122,6 +122,16 @@ def test_a_lamp_that_stays_lit_is_put_off_and_the_next_command_names_it(limited)
     assert bank.lit == {1}
 
 
+def test_after_a_standstill_a_lamp_counts_as_commanded_on_not_as_lit(limited):
+    """The bank's watchdog has put it off meanwhile: how long it was lit, nobody here knows."""
+    _, lights, clock = limited(max_on_s=12.0)
+    lights.select(7)
+    clock.now += 26.1
+    lights.enforce()
+    with pytest.raises(SafetyRefusal, match=r"commanded on for 26\.1 s.*that stood still"):
+        lights.status()
+
+
 def test_a_change_of_lamps_begins_anew_and_the_same_lamp_does_not(limited):
     bank, lights, clock = limited(max_on_s=2.0)
     for lamp in (0, 1, 2):
