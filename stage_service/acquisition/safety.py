@@ -96,8 +96,8 @@ def blackout(devices: DeviceSet, attempts: int = ATTEMPTS, within_s: float = WIT
             problem = f" {device.name}: not dark within {within_s:.3g} s."
         if problem and can.dead_man:
             problem += (
-                f" Its watchdog puts it off {config.watchdog_s:g} s after the service's last "
-                "heartbeat; what is lit after that does not obey it: cut the supply."
+                f" Its watchdog acts {config.watchdog_s:g} s after the service's last heartbeat; a "
+                "light that is on after that does not obey the device: cut the supply."
             )
         problems += problem
         if not problem and not can.reads_back:

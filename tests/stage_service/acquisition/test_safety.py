@@ -80,7 +80,7 @@ def test_a_fault_of_one_driver_does_not_keep_the_projectors_lit():
     assert not beams.lit
     assert not result.safe
     assert "ZeroDivisionError: a fault of the driver" in result.detail
-    assert "Its watchdog puts it off 2 s after the service's last heartbeat" in result.detail
+    assert "Its watchdog acts 2 s after the service's last heartbeat; a light" in result.detail
     assert result.blocks
 
 
