@@ -62,7 +62,6 @@ class World:
         self.stuck_lamps = False  # lamps cannot be put off
         self.deaf_lights = False  # the light bank takes requests and answers none
         self.late: list[str] = []  # serial requests answered together with the next one
-        self.garbage = b""  # sent before the next serial reply
         self.hold_pulses = False  # the trigger box fires, and does not answer until `Wires.flush`
         self.pulses_held = 0
         self.put_on: Callable[[set[Any]], object] = lambda _lamps: None  # what lights up, at once
@@ -280,8 +279,7 @@ class SerialPeer:
                         self.world.pulses_held += 1
                         held += reply
                         continue
-                    garbage, self.world.garbage = self.world.garbage, b""
-                os.write(self.master, held + garbage + reply)
+                os.write(self.master, held + reply)
                 held = b""
 
     def flush(self) -> None:
