@@ -50,7 +50,6 @@ from stage_service.stopping import NotEnded, Step, end_all
 from stage_service.storage import NotThere, Storage
 from stage_service.submitting import NotFinished, Submitting
 from stage_service.trash import Removed
-from stage_service.verification import Verification, Verifier
 from stage_service.viewer import RemoteViewing, Source, Tracer
 from stage_service.watching import NotReady, Watching
 
@@ -105,7 +104,6 @@ class Service:
             self.decoder,
             self._tracer,
         )
-        self._verifier = Verifier(self.events, lambda: self._captures.running is not None)
         self.calibrating = Calibrating(root / "calibration", rig_file, self.events, self.decoder)
         self.frames = Frames(self.capture_path, self.decoder, self.calibrating)
         self._closing = threading.Lock()
@@ -130,7 +128,6 @@ class Service:
         self._captures.catalogue.begin(
             self._read, self._all_read, lambda: self._captures.running is not None, READ_S
         )
-        self._verifier.start()
 
     def _read(self, status: CaptureStatus) -> None:
         if status.outcome == "completed":
@@ -171,7 +168,6 @@ class Service:
                 [
                     Step("lamps and capture", self._close_captures, LIGHTS_S),
                     Step("the queue", self.queue.close, OTHERS_S),
-                    Step("the verifier", self._verifier.close, OTHERS_S),
                     Step("the calibration", self.calibrating.close, OTHERS_S),
                     Step("the decoder", self.decoder.close, OTHERS_S),
                     Step("the tracer", self._tracer.close, OTHERS_S),
@@ -245,7 +241,6 @@ class Service:
         word = self._control.word(by, "resume", armed_by)
         work = partial(self._captures.resume, capture_id, word)
         status = self._control.do(by, "capture.resume", work, capture_id)
-        self._verifier.forget(capture_id)  # its problems may be what is shot now
         return self._view(status)
 
     def abort(self, capture_id: str, by: Caller) -> CaptureView:
@@ -295,22 +290,7 @@ class Service:
         check_kept(capture_id)
         pending = self._follower.is_pending
         with self.jobs.lock:
-            removed = self.storage.remove_capture(capture_id, pending, by, dry_run=dry_run)
-        if not dry_run:
-            self._verifier.forget(capture_id)
-        return removed
-
-    def verify(self, capture_id: str, by: Caller) -> Verification:
-        """Verify every file of a capture. Raises as `done_capture`, and `BadInput` for a
-        snapshot."""
-        check_kept(capture_id)
-        work = partial(self._verifier.submit, capture_id, self.done_capture(capture_id))
-        return self._control.do(by, "capture.verify", work, capture_id, steers=False)
-
-    def verification(self, capture_id: str) -> Verification:
-        """The newest verification of a capture. Raises `UnknownCapture`."""
-        self.capture_path(capture_id)
-        return self._verifier.get(capture_id)
+            return self.storage.remove_capture(capture_id, pending, by, dry_run=dry_run)
 
     def capture_path(self, capture_id: str) -> Path:
         """The capture's folder, also one added by hand or by `import`. Raises `UnknownCapture`,
@@ -373,7 +353,7 @@ class Service:
     def health(self) -> Health:
         """The state of service, lamps and jobs; queries no device and no database, waits for no
         disk."""
-        return self.watching.health(stopping=self._stopping, damaged=self._verifier.damaged)
+        return self.watching.health(stopping=self._stopping)
 
     def rig(self) -> RigView:
         """The poses of lights, cameras and projectors, and defaults of plans."""

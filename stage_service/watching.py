@@ -78,15 +78,13 @@ class Watching:
             found.append(f"{self.root}: {left}")
         return found
 
-    def health(self, *, stopping: bool, damaged: list[str]) -> Health:
-        """The service's health; `damaged` captures are a problem."""
+    def health(self, *, stopping: bool) -> Health:
+        """The service's health."""
         free_bytes, worker = self.disk()
         lamps, latched = self.captures.safety(), self.captures.stage.latch.latched
         problems = [p for p in (self.queue.set_aside, self.queue.problem) if p is not None]
         if stopping:
             problems.insert(0, "the service is stopping and lights nothing")
-        if damaged:
-            problems.append(f"damaged captures: {', '.join(damaged[:5])}")
         if latched is not None:
             problems.insert(0, latched.detail)
         return Health(

@@ -27,7 +27,7 @@ read         GET     /captures /captures/{capture} /captures/{capture}/steps
 read         GET     /captures/{capture}/frames/{step}/{camera}.exr
 read         GET     /captures/{capture}/frames/{step}/{camera}.png
 read         GET     /captures/{capture}/frames/{step}/{camera}.json
-read         GET     /captures/{capture}/archive.tar /captures/{capture}/verification
+read         GET     /captures/{capture}/archive.tar
 read         GET     /captures/{capture}/board/{camera} /calibration /calibration/rig.json
 read         GET     /jobs /jobs/{job} /jobs/{job}/report
 read         GET     /jobs/{job}/artifacts /jobs/{job}/artifacts/{path:path}
@@ -57,7 +57,7 @@ admin|steer! DELETE  /lease
 steer!       PUT     /uploads/{subject}/head.obj /uploads/{subject}/masks/{camera}.png
 steer!       DELETE  /uploads/{subject}
 arm!         POST    /devices/acknowledge
-jobs!        POST    /jobs /captures/{capture}/verify /calibration
+jobs!        POST    /jobs /calibration
 jobs!        DELETE  /jobs/{job}
 admin!       DELETE  /models/{model} /trash
 admin!       POST    /trash/{name}/restore

@@ -1,20 +1,19 @@
-"""Routes of what lies under the root folder: downloads, uploads, removal, verification."""
+"""Routes of what lies under the root folder: downloads, uploads, removal."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response, status
+from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from reconstruction.containment import LONGEST_NAME
 from stage_service.api.downloads import RANGES, tar_response
 from stage_service.api.lanes import OnLanes
-from stage_service.api.steering import READS, Administrates, OnService, Processes, Steers
+from stage_service.api.steering import READS, Administrates, OnService, Steers
 from stage_service.service_models import FILE_NAME
 from stage_service.storage import KEPT_DAYS, Folder, files_of
 from stage_service.trash import Removed
-from stage_service.verification import Verification
 
 router = APIRouter(tags=["storage"])
 reading = APIRouter(dependencies=READS, tags=["storage"])
@@ -41,18 +40,6 @@ async def remove_capture(
 def get_capture_archive(capture: str, service: OnService) -> Response:
     """All files of a capture that is done, as a tar file; goes on by ranges where it broke off."""
     return tar_response(capture, files_of(f"the capture {capture}", service.done_capture(capture)))
-
-
-@router.post("/captures/{capture}/verify", status_code=status.HTTP_202_ACCEPTED)
-def verify_capture(capture: str, service: OnService, by: Processes) -> Verification:
-    """Read every file of a capture again, beside all else and not while the stage shoots."""
-    return service.verify(capture, by)
-
-
-@reading.get("/captures/{capture}/verification")
-def get_verification(capture: str, service: OnService) -> Verification:
-    """When a capture was last read again, and what was wrong with it."""
-    return service.verification(capture)
 
 
 @reading.get("/models")

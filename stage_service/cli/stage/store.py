@@ -42,11 +42,6 @@ def add(commands: Commands) -> None:
         parser.add_argument(
             "--dry-run", action="store_true", help="only list what would be removed"
         )
-    verify = add_remote(store, "verify", run_verify)
-    verify.add_argument("capture", help="its id")
-    verify.add_argument(
-        "--show", action="store_true", help="show the last result, start no verification"
-    )
     upload = add_remote(store, "upload", run_upload)
     upload.add_argument("subject", help="name of the subject, for --upload of captures")
     upload.add_argument("--head", type=Path, help="the digitised head (.obj)")
@@ -88,16 +83,6 @@ def run_empty(args: argparse.Namespace, output: Output, service: ServiceClient) 
     """Delete old entries of the trash for good; needs the scope admin."""
     query = f"older_than_days={args.older_than_days}&dry_run={args.dry_run}"
     _list(service.request("DELETE", f"/trash?{query}"), output, "nothing is that old")
-
-
-def run_verify(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Verify every file of a capture against its checksum, on the service."""
-    if args.show:
-        found = service.get(f"/captures/{in_url(args.capture)}/verification")
-    else:
-        found = service.post(f"/captures/{in_url(args.capture)}/verify")
-    last = f"{found['wrong']} wrong at {found['finished']}" if found["finished"] else "never read"
-    output.result(found, "\n".join([f"{found['state']}; {last}", *found["problems"]]))
 
 
 def run_upload(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:

@@ -1,7 +1,7 @@
 // Captures and their frames: by camera, by light, and as a film.
 
-import { attempt, notice } from "./acts.js";
-import { ask, captureAt, get } from "./ask.js";
+import { attempt } from "./acts.js";
+import { captureAt, get } from "./ask.js";
 import { button, clock, h, keyed, number, say, seconds } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, events } from "./state.js";
@@ -113,7 +113,6 @@ function captureOf(view, id) {
     if (c.error) facts.append(h("div", h("dt", "Error"), h("dd.bad", c.error)));
     acts.replaceChildren(
       h("a.button", { href: `${captureAt(id)}/archive.tar`, download: "" }, "Download"),
-      button("Read again and verify", () => attempt(async () => { await ask(`POST ${captureAt(id)}/verify`); notice("Every file of the capture is read again."); })),
       c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Its job") : "",
     );
   }

@@ -516,8 +516,6 @@ def test_every_route_of_the_api_is_there_and_documented(http):
         "POST /devices/acknowledge",
         "DELETE /captures/{capture}",
         "GET /captures/{capture}/archive.tar",
-        "POST /captures/{capture}/verify",
-        "GET /captures/{capture}/verification",
         "GET /models",
         "DELETE /models/{model}",
         "GET /models/{model}/archive.tar",

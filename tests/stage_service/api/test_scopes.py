@@ -30,7 +30,6 @@ OTHERS = {
     "POST /devices/acknowledge": {"arm"},
     "POST /jobs": {"jobs"},
     "DELETE /jobs/{job}": {"jobs"},
-    "POST /captures/{capture}/verify": {"jobs"},
     "POST /calibration": {"jobs"},
     "PUT /view/models/{name}/environments/{file}": {"jobs", "steer"},
     "DELETE /models/{model}": {"admin"},

@@ -1,4 +1,4 @@
-"""What lies on the service's disk: fetched, removed and restored, read again, uploaded."""
+"""What lies on the service's disk: fetched, removed and restored, uploaded."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 from serving import Client, serving, slug
-from waiting import gone, orphan, until
+from waiting import until
 
 from reconstruction import Capture, Model, verify
 from stage_service.acquisition.states import CaptureStatus
@@ -204,66 +204,6 @@ def test_who_may_remove(rig_file, world, tmp_path):
         assert http.delete(f"/captures/{whole}").status_code == 200
 
 
-def test_a_capture_is_read_again_beside_the_service_and_damage_is_told(http):
-    capture = shot(http)
-    path = f"/captures/{capture['id']}"
-    assert http.get(f"{path}/verification").json()["state"] == "never"
-    assert http.post(f"{path}/verify").status_code == 202
-    found = until(lambda: _done(http, path), pause=0.1)
-    assert (found["wrong"], found["problems"]) == (0, [])
-    frame = next(Path(capture["path"]).glob("frames/*1/cam_0.exr"))
-    data = bytearray(frame.read_bytes())
-    data[-1] ^= 1
-    frame.write_bytes(data)
-    http.post(f"{path}/verify")
-    found = until(lambda: _done(http, path, after=found["finished"]), pause=0.1)
-    assert found["wrong"] == 1
-    assert "does not match its checksum" in found["problems"][0]
-    events = http.service.events.wait(0, 0)
-    assert [e.kind for e in events if e.data.get("wrong") is not None] == [
-        *("capture.verified", "capture.damaged")
-    ]
-    assert capture["id"] in http.get("/health").json()["problems"][0]
-    assert http.get("/health").json()["status"] == "degraded"
-    http.delete(path)
-    assert http.get("/health").json()["status"] == "ok"
-
-
-def test_what_was_wrong_with_a_capture_that_goes_on_is_told_no_more(http, world):
-    capture = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
-    path = f"/captures/{capture}"
-    until(lambda: world.pulses > 3)
-    http.post(f"{path}/abort")
-    until(lambda: http.get(path).json()["state"] == "done")
-    http.post(f"{path}/verify")
-    assert until(lambda: _done(http, path), pause=0.1)["wrong"] > 0
-    assert http.get("/health").json()["status"] == "degraded"
-    http.post(f"{path}/resume").raise_for_status()
-    until(lambda: http.get(path).json()["state"] == "done")
-    assert http.get(path).json()["outcome"] == "completed"
-    assert http.get(f"{path}/verification").json()["state"] == "never"
-    assert http.get("/health").json()["status"] == "ok"
-
-
-def test_what_is_being_read_of_a_capture_that_goes_on_counts_for_nothing(http, monkeypatch):
-    capture = shot(http)
-    found = threading.Event()
-    verifier = http.service._verifier
-    monkeypatch.setattr(verifier, "_verify", lambda *_: found.wait(60) and ["of before"])
-    verifier.submit(capture["id"], Path(capture["path"]))
-    until(lambda: verifier.get(capture["id"]).state == "running")
-    verifier.forget(capture["id"])
-    found.set()
-    verifier.submit("another", Path(capture["path"]))
-    until(lambda: verifier.get("another").state == "done")
-    assert verifier.damaged == ["another"]
-
-
-def _done(http: Client, path: str, after: str = "") -> Any:
-    found = http.get(f"{path}/verification").json()
-    return found if found["state"] == "done" and found["finished"] > after else None
-
-
 def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monkeypatch):
     capture = shot(http)
     pipeline = {"name": "reconstruct", "options": {"method": "auto"}}
@@ -289,9 +229,9 @@ def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monke
 def test_a_snapshot_is_nothing_to_keep(http):
     http.post("/snapshot", json={})
     until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
-    for answer in (http.delete("/captures/snapshot"), http.post("/captures/snapshot/verify")):
-        assert slug(answer) == "bad-input"
-        assert "kept until the next one only" in answer.json()["detail"]
+    answer = http.delete("/captures/snapshot")
+    assert slug(answer) == "bad-input"
+    assert "kept until the next one only" in answer.json()["detail"]
     assert http.get("/trash").json() == []
 
 
@@ -304,29 +244,6 @@ def test_a_snapshot_is_there_until_the_next_one_whatever_becomes_of_the_service(
         assert http.get("/captures/snapshot").json()["outcome"] == "completed"
         assert http.get("/captures/snapshot/steps").json()[0]["light"] == "light_003"
         assert http.get("/captures").json() == []
-
-
-def test_what_reads_a_capture_again_ends_with_a_service_that_is_killed(tmp_path):
-    code = """
-import subprocess, sys, time
-from pathlib import Path
-from stage_service import verification
-from stage_service.records.events import EventLog
-
-class Told(subprocess.Popen):
-    def send_signal(self, number):
-        super().send_signal(number)
-        print(self.pid, flush=True)
-
-verification.subprocess.Popen = Told
-root = Path(sys.argv[1])
-one = verification.Verifier(EventLog(), lambda: True)
-one.start()
-one.submit("any", root)
-time.sleep(600)
-"""
-    child = orphan(code, tmp_path)
-    until(lambda: gone(child))
 
 
 def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
@@ -470,8 +387,6 @@ def test_the_command_line_of_the_store(http, tmp_path, capsys):
     trashed = run("store", "remove", "capture", name)["name"]
     assert [t["name"] for t in run("store", "trash")["trash"]] == [trashed]
     run("store", "restore", trashed)
-    assert run("store", "verify", name)["capture"] == name
-    until(lambda: _done(http, f"/captures/{name}"), pause=0.1)
     run("store", "remove", "capture", name)
     assert len(run("store", "empty", "--older-than-days", "0")["trash"]) == 1
 
