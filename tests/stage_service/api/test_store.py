@@ -431,6 +431,6 @@ def test_what_is_no_service_of_ours_is_told_so(capsys):
             url = f"http://127.0.0.1:{server.server_port}"
             assert main([*words, "--url", url]) == 4
             told = capsys.readouterr().err
-            assert "not as hairstage does" in told
+            assert "no document of hairstage" in told
             assert "Traceback" not in told
         server.shutdown()
