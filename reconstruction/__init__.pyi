@@ -1,8 +1,8 @@
 from .capture.folder import Capture as Capture
-from .capture.folder import CaptureError as CaptureError
-from .capture.folder import MissingFrame as MissingFrame
-from .capture.folder import Step as Step
 from .capture.import_folder import import_folder as import_folder
+from .capture.records import CaptureError as CaptureError
+from .capture.records import MissingFrame as MissingFrame
+from .capture.records import Step as Step
 from .capture.verify import verify as verify
 from .capture.writer import CaptureWriter as CaptureWriter
 from .files.exr import read_exr as read_exr

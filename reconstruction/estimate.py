@@ -14,8 +14,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from reconstruction.capture.folder import Capture, CaptureError, MissingFrame, Step, StepKind
-from reconstruction.capture.kept_frames import kept_bytes
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.frame_cache import cache_bytes
+from reconstruction.capture.records import CaptureError, MissingFrame, Step, StepKind
 from reconstruction.geometry.cameras import Camera
 from reconstruction.head.capture_head import HeadPoints, digitised_points
 from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
@@ -101,7 +102,7 @@ def estimate(
     progress("probed", 1.0)
     frames = sum(capture.has(s, c.name) for s in capture.steps for c in capture.rig.cameras)
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
-    disk_gb, working_gb = 0.01 + each * probe.points, kept_bytes(capture) / GB
+    disk_gb, working_gb = 0.01 + each * probe.points, cache_bytes(capture) / GB
     return Estimate(method, tuple(stages), frames, disk_gb, working_gb)
 
 

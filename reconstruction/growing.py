@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array
-from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid

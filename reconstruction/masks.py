@@ -17,7 +17,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import mesh_depth

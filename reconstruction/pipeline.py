@@ -7,8 +7,9 @@ from functools import cached_property
 from typing import Literal
 
 from reconstruction.arrays import AnyFloats
-from reconstruction.capture.folder import Capture, CaptureError
-from reconstruction.capture.kept_frames import frames_kept
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
+from reconstruction.capture.frame_cache import cached_frames
 from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.growing import GrowingStages
@@ -24,7 +25,7 @@ from reconstruction.masks import MaskedCapture
 from reconstruction.methods import METHODS, Method
 from reconstruction.model import Model
 from reconstruction.reconstruct_options import ReconstructOptions
-from reconstruction.report.progress import ToldReport
+from reconstruction.report.progress import ReportWithProgress
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.stages import MeasuringStages, Stages, method_for
 from reconstruction.tangents.estimate import Measured
@@ -66,8 +67,8 @@ def reconstruct(
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
     expected = STAGES[method_for(capture) if method == "auto" else method]
-    report = ToldReport(progress, expected)
-    with frames_kept(capture, model.path) as kept:
+    report = ReportWithProgress(progress, expected)
+    with cached_frames(capture, model.path) as kept:
         run = _Run(Stages(model.create(), options, report.progress, report), kept)
         run.reconstruct(method, motion)
     if not any(stage.name == "head" for stage in report.stages):
@@ -120,9 +121,9 @@ class _Run:
         if method == "photometric" or method == "lmvs":
             self.line_stereo(masked, head, method)
         elif method == "hull":
-            self.hull(masked, cloud, head or heads.by_light(masked))
+            self.hull(masked, cloud, head or heads.fit_by_shading(masked))
         else:
-            head = head or heads.under_skin(masked, cloud)
+            head = head or heads.fit_to_skin_points(masked, cloud)
             envelope, depths = measuring.envelope(masked, cloud, head.mesh)
             measured = measuring.tangents(masked, cloud, depths)
             polylines, lines = measuring.surface(measured, cloud), measured

@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from reconstruction import Camera, Projector
 from reconstruction.arrays import AnyFloats
-from reconstruction.capture.folder import StepKind
+from reconstruction.capture.records import StepKind
 from reconstruction.containment import LONGEST_NAME
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import Entry

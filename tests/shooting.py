@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reconstruction import Camera, Capture, CaptureWriter, Rig, Step
-from reconstruction.capture.folder import FrameRecord
+from reconstruction.capture.records import FrameRecord
 from simulators.frames.frames import FrameMaker, Sensor, Snapshot
 from simulators.frames.responses import Responder
 from simulators.peers.projector_controller import FULL, Show

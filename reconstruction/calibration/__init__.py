@@ -1,1 +1,1 @@
-"""A stage's geometry from captures of a board and of spheres; see `solve.calibrate`."""
+"""Calibration of a stage from captures of a board and spheres; see `solve.calibrate`."""

@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import Array, Bools, Ints
 
-PER_SQUARE = 64  # pixels along a square of the print that pictures are compared with
+PER_SQUARE = 64  # pixels per square of the rendered print
 
 
 class CalibrationError(ValueError):
-    """Captures that do not determine what is asked; says which, why, and what to shoot."""
+    """Captures that do not determine the calibration; says which, why, and what to capture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Corners that a picture shows: their numbers `ids (N,)` and `pixels (N, 2)`."""
+    """Corners detected in an image: `ids (N,)` and `pixels (N, 2)`."""
 
     ids: Ints
     pixels: Array
@@ -34,8 +34,8 @@ class Sighting:
 class Board:
     """`columns` × `rows` squares of edge `square` with markers of edge `marker`, metres.
 
-    The board's frame: origin at the printed picture's top left corner, x right, y down, z away from
-    who looks at it. `dictionary` is OpenCV's name. The pattern is that of OpenCV 4.6 and later.
+    The board's frame: origin at the print's top left corner, x right, y down, z away from the
+    viewer. `dictionary` is OpenCV's name. The pattern is that of OpenCV 4.6 and later.
     """
 
     columns: int = 9
@@ -47,7 +47,8 @@ class Board:
     def __post_init__(self) -> None:
         if not (self.dictionary.startswith("DICT_") and hasattr(cv2.aruco, self.dictionary)):
             raise CalibrationError(
-                f"board: OpenCV has no dictionary {self.dictionary!r}; one is 'DICT_4X4_50'"
+                f"board: OpenCV has no dictionary {self.dictionary!r}; expected, for example, "
+                "'DICT_4X4_50'"
             )
         sizes = 1e-6 <= self.square <= 1e3 and 0.1 * self.square <= self.marker < self.square
         if min(self.columns, self.rows) < 3 or not sizes:
@@ -74,16 +75,16 @@ class Board:
         return self.square * np.array([self.columns, self.rows])
 
     def picture(self, per_square: int = PER_SQUARE) -> NDArray[np.uint8]:
-        """What to print `(H, W)`: 0 where there is ink, else 255; `per_square` pixels a square."""
+        """The image to print `(H, W)`: ink 0, paper 255; `per_square` pixels per square."""
         size = (self.columns * per_square, self.rows * per_square)
         return np.asarray(self._opencv.generateImage(size))
 
     def ink(self, points: ArrayLike) -> Bools:
-        """Whether board points `(..., 2)` are inked; beyond the picture they are not."""
+        """Whether board points `(..., 2)` are inked; outside the print they are not."""
         return self._look_up(self.picture() < 128, points, 0)
 
     def plain(self, points: ArrayLike, margin: float) -> Bools:
-        """Whether board points `(..., 2)` are `margin` metres or more inside one colour."""
+        """Whether board points `(..., 2)` are at least `margin` metres inside one colour."""
         ink = (self.picture() < 128).astype(np.uint8)
         reach = int(np.ceil(margin * PER_SQUARE / self.square))
         kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
@@ -98,13 +99,13 @@ class Board:
         return np.asarray(inside & picture[at[..., 1], at[..., 0]])
 
     def find(self, image: ArrayLike) -> Sighting:
-        """The corners seen in a linear grey `image (H, W)`; none where the board is not seen."""
+        """The corners detected in a linear grey `image (H, W)`, none without a board."""
         grey = np.asarray(image, np.float64)
         none = Sighting(np.zeros(0, np.int64), np.zeros((0, 2)))
         white = float(np.percentile(grey, 99.5))
         if not white > 0:
             return none
-        # a square root spreads the dark squares' noise less than the eye's gamma would
+        # a square root amplifies the dark squares' noise less than a display gamma
         eight = np.rint(255 * np.sqrt(np.clip(grey / white, 0, 1))).astype(np.uint8)
         corners, ids, _, _ = self._detector.detectBoard(eight)
         if ids is None or not len(ids):
@@ -114,11 +115,11 @@ class Board:
         return self._refined(grey / white, rough) if len(rough) >= 6 else rough
 
     def _refined(self, image: Array, rough: Sighting) -> Sighting:
-        """Corners shifted to where the print about them fits the picture best (Lucas, Kanade 1981).
+        """Corners refined by aligning the print with the image around them (Lucas, Kanade 1981).
 
-        The detector's own window ends short of the markers; here they help. A homography says how
-        the print lies, each corner's shift takes up what a lens bends. Corners whose surroundings
-        do not correlate with the print are dropped.
+        Unlike the detector's window, the patch includes the markers. A homography maps the print,
+        each corner's shift accounts for distortion. Corners whose patch does not correlate with the
+        print are removed.
         """
         flat = self.corners[rough.ids][:, :2]
         H, _ = cv2.findHomography(flat, rough.pixels, cv2.RANSAC, 2.0)
@@ -149,10 +150,10 @@ class Board:
             fit = np.linalg.solve(normal, np.einsum("nki,nk->ni", A, shown * inside)[..., None])
             contrast = np.maximum(fit[:, 0, 0], 1e-6)[:, None]
             at = at - np.clip(fit[:, 2:, 0] / contrast, -1, 1)
-        explained = (A @ fit)[..., 0] - shown * inside
+        residual = (A @ fit)[..., 0] - shown * inside
         mean = (shown * inside).sum(axis=1, keepdims=True) / inside.sum(axis=1, keepdims=True)
         spread = (((shown - mean) * inside) ** 2).sum(axis=1)
-        good = (explained**2).sum(axis=1) < 0.15 * spread
+        good = (residual**2).sum(axis=1) < 0.15 * spread
         good &= np.linalg.norm(at - rough.pixels, axis=1) < 1.5
         return Sighting(rough.ids[good], at[good])
 

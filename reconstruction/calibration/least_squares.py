@@ -1,4 +1,4 @@
-"""Least squares with the covariance that says what the data left open."""
+"""Least squares with a covariance that shows undetermined directions."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Solution:
     """Parameters `x (N,)` with their `covariance (N, N)`, and the residuals `(M,)` there.
 
     `conditioning` is the smallest eigenvalue over the mean one of the normal matrix with unit
-    diagonal, 0 where the data leaves a direction open; `weakest (N,)` is that direction, in units
-    of the parameters. The covariance is huge along it then.
+    diagonal, 0 for an undetermined direction, along which the covariance is huge; `weakest (N,)` is
+    that direction in units of the parameters.
     """
 
     x: Array
@@ -37,15 +37,15 @@ class Solution:
         return np.sqrt(np.diag(self.covariance))
 
 
-OPEN = 1e-12  # a conditioning below which a direction counts as open
+OPEN = 1e-12  # conditioning below which a direction is undetermined
 
 
 def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
-    """Minimise residuals in units of their standard deviation, within a region of trust.
+    """Minimise residuals in units of their standard deviation, by a trust region method.
 
     `function(x)` of `x (N,)` returns the residuals `(M,)` and their derivatives `(M, N)`. Residuals
-    beyond `huber` deviations count linearly. The covariance grows with the residuals where they are
-    larger than their deviations promised, and never shrinks.
+    beyond `huber` deviations count linearly. The covariance is scaled up if the residuals exceed
+    their deviations, never down.
     """
     x = np.array(x, dtype=np.float64)
     last: dict[bytes, tuple[Array, Any]] = {}
@@ -53,7 +53,7 @@ def minimise(function: Linearised, x: Array, *, huber: float = 3.0) -> Solution:
     def at(x: Array) -> tuple[Array, Any]:
         if (key := x.tobytes()) not in last:
             last.clear()
-            with np.errstate(all="ignore"):  # a wild step is refused
+            with np.errstate(all="ignore"):  # such a step is rejected
                 last[key] = function(x)
         return last[key]
 
@@ -81,8 +81,8 @@ def _solution(x: Array, r: Array, J: Any, huber: float) -> Solution:
     A = J.T @ (sparse.diags_array(weights) @ J)
     A = A.toarray() if sparse.issparse(A) else A
     diagonal = np.sqrt(np.diag(A))
-    seen = diagonal > 0
-    scale = np.where(seen, diagonal, 1.0)
+    observed = diagonal > 0
+    scale = np.where(observed, diagonal, 1.0)
     values, vectors = np.linalg.eigh(A / np.outer(scale, scale))
     conditioning = max(float(values[0]), 0.0) / max(float(values.mean()), np.finfo(float).tiny)
     with np.errstate(divide="ignore"):

@@ -1,4 +1,4 @@
-"""A calibrated rig beside the true one, once their worlds are brought together."""
+"""Comparison of a calibrated rig with a true or a nominal one, after alignment."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
 NOMINAL = 0.03
-"""Metres: what nominal places are off by, all cameras' distances from their middle together."""
-SCALE = 0.05  # of a length: by more, with `NOMINAL`, the board's square is another than told
+"""Metres: expected error of nominal positions, RMS of all cameras about their middle."""
+SCALE = 0.05  # relative difference of size above which the board's square is doubted
 ELSEWHERE, TURNED = 0.15, 15.0
-"""Metres and degrees from its nominal place where a camera is taken for another."""
+"""Metres and degrees from its nominal pose above which a camera is reported."""
 
 
 def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
-    """Errors of `found` against `truth` in the frame in which the cameras agree best.
+    """Errors of `found` against `truth` after aligning the cameras.
 
     By camera: `reprojection_px`, mean and largest over a head-sized ball of points; `centre_mm`;
-    `turn_deg`. By projector: the rows' error over the same points, `plane_mm` what that is where
-    they are, `axis_mm` and `along_axis_mm` of its centre across and along its x axis, `turn_deg`.
-    By light: `position` over its distance from the origin, `direction_deg`, `intensity`, the
-    channel that is furthest off, over the brightest of the true light.
-    Devices are matched by name; raises `KeyError` for one that `truth` lacks.
+    `turn_deg`. By projector: `rows`, RMS over the same points, and `plane_mm`, the largest distance
+    of the planes there; `axis_mm` and `along_axis_mm`, the centre across and along the x axis;
+    `turn_deg`. By light: `position` relative to its distance from the origin, `direction_deg`, and
+    `intensity`, the worst channel relative to the brightest true one.
+    Devices are matched by name; raises `KeyError` for one missing in `truth`.
     """
     ball, found = _ball(), aligned(found, truth)
     cameras = {}
@@ -59,9 +59,9 @@ def compare_rigs(found: Rig, truth: Rig) -> dict[str, Any]:
 
 
 def aligned(found: Rig, truth: Rig) -> Rig:
-    """`found`, moved to where its cameras see a head-sized ball of points most as `truth`'s do.
+    """`found`, moved so that its cameras project a head-sized ball of points most like `truth`'s.
 
-    Poses alone trade turns for principal points. Raises `KeyError` as `compare_rigs`.
+    Aligning poses alone would confuse rotations with principal points. Raises `KeyError`.
     """
     ball = _ball()
     same = [truth.camera(c.name) for c in found.cameras]
@@ -83,20 +83,19 @@ def aligned(found: Rig, truth: Rig) -> Rig:
 
 
 def unlike_nominal(found: Sequence[Camera], nominal: Sequence[Camera], square: float) -> list[str]:
-    """Sentences on what of `found` cannot be as in `nominal`, whose cameras are the same in order.
+    """Warnings on cameras `found` that contradict `nominal`, in the same order and frame.
 
-    Of `found` in the frame in which both agree best, by a board with squares of `square` metres: a
-    wrong length of them makes the stage larger or smaller, and what is called by another's name
-    stands elsewhere; neither shows in how well corners are met.
+    A wrong length `square` of the board's squares, metres, scales the stage; an exchanged name
+    displaces a camera. Neither affects the reprojection error.
     """
     out = []
     ours, theirs = (np.array([c.center for c in cameras]) for cameras in (found, nominal))
     a, b = (float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())) for x in (ours, theirs))
     if b > NOMINAL and abs(a - b) > max(NOMINAL, SCALE * b):
         out.append(
-            f"the cameras stand {abs(a / b - 1):.0%} "
-            f"{'further apart' if a > b else 'nearer together'} than in the nominal rig: is a "
-            f"square of the board {1e3 * square:g} mm?"
+            f"the cameras are {abs(a / b - 1):.0%} "
+            f"{'further apart' if a > b else 'closer together'} than in the nominal rig: check "
+            f"that a square of the board measures {1e3 * square:g} mm"
         )
     off = np.linalg.norm(ours - theirs, axis=1)
     turn = [_turn_deg(*pair) for pair in zip(found, nominal, strict=True)]
@@ -107,8 +106,8 @@ def unlike_nominal(found: Sequence[Camera], nominal: Sequence[Camera], square: f
     ]
     if elsewhere:
         out.append(
-            f"cameras stand elsewhere than in the nominal rig ({'; '.join(elsewhere)}): have two "
-            "of them each other's name? The world is laid by the nominal places"
+            f"cameras differ from their nominal poses ({'; '.join(elsewhere)}): check for "
+            "exchanged names; the world frame is aligned with the nominal positions"
         )
     return out
 

@@ -1,7 +1,7 @@
-"""Lights from the shading of diffuse spheres: Lambert's law near to it.
+"""Lights from the shading of diffuse spheres by Lambert's law for near lights.
 
-Radiance = albedo / π · I · n·v / |v|³, v from a point of the sphere to the light: the shading says
-where the light comes from, its fall-off over the sphere how far, and its strength how strong.
+Radiance = albedo / π · I · n·v / |v|³, with v from a point of the sphere to the light: the shading
+gives the direction, the fall-off over the sphere the distance, the level the intensity.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.calibration.solve_lights import LOOSE, CalibratedLight
 from reconstruction.geometry.lights import Light
 
-MODEL = 0.01  # of a radiance: no sphere is Lambertian, and no pixel's mean its middle, to better
-STEEPEST = 0.15  # cosine of incidence: flatter light shows the sphere's grain
+MODEL = 0.01  # relative error of Lambert's law and of pixel means
+STEEPEST = 0.15  # least cosine of incidence: grazing light shows the sphere's texture
 
 
 @dataclass(frozen=True, eq=False)
 class Shading:
-    """Pixels that see diffuse spheres of one radius and albedo under one light alone.
+    """Pixels on diffuse spheres of one radius and albedo under one light alone.
 
-    `eyes` and `rays (N, 3)`, the number of the `sphere (N,)` they meet, `radiance (N, 3)` at full
-    level, and its `deviation (N,)` from noise. `centres (S, 3)` with `covariance (3 S, 3 S)`.
+    `eyes` and `rays (N, 3)`, the index of the `sphere (N,)`, `radiance (N, 3)` at full level, and
+    its `deviation (N,)` by noise. `centres (S, 3)` with `covariance (3 S, 3 S)`.
     """
 
     eyes: Array
@@ -42,7 +42,7 @@ class Shading:
 
     @cached_property
     def surface(self) -> tuple[Array, Array]:
-        """Points and normals `(N, 3)` where the rays meet the spheres, or come nearest to them."""
+        """Points and normals `(N, 3)` where the rays meet the spheres, or pass closest."""
         towards = self.centres[self.sphere] - self.eyes
         along = (self.rays * towards).sum(axis=1)
         inside = along**2 - ((towards * towards).sum(axis=1) - self.radius**2)
@@ -56,7 +56,7 @@ class Shading:
 
     @cached_property
     def error(self) -> Array:
-        """Standard deviation of `grey (N,)`, of noise and of the law."""
+        """Standard deviation of `grey (N,)`, by noise and model error."""
         return np.hypot(self.deviation, MODEL * self.grey)
 
     def thinned(self, every: int) -> Shading:
@@ -65,7 +65,7 @@ class Shading:
         return replace(self, **{f: getattr(self, f)[::every] for f in fields})
 
     def form(self, light: Light) -> Array:
-        """Radiance `(N,)` that `light` would give at an intensity of 1."""
+        """Radiance `(N,)` under `light` at an intensity of 1."""
         points, normals = self.surface
         v = light.position - points
         strength = replace(light, intensity=np.ones(3)).intensity_towards(points)[:, 0]
@@ -73,7 +73,7 @@ class Shading:
         return np.asarray(self.albedo / np.pi * strength * falling)
 
     def used(self, light: Light) -> Bools:
-        """Pixels `(N,)` that `light` reaches well."""
+        """Pixels `(N,)` well lit by `light`."""
         points, normals = self.surface
         v = light.position - points
         cosine = (normals * v).sum(axis=1) / np.linalg.norm(v, axis=1)
@@ -83,15 +83,14 @@ class Shading:
 def shaded_light(nominal: Light, shading: Shading) -> CalibratedLight:
     """Position and intensity of a light from diffuse spheres in known places.
 
-    `nominal` gives the light's profile and aim, which stay, and a first distance. Raises
-    `CalibrationError` where the spheres are not lit or the distance stays open.
+    `nominal` gives profile and aim, which are kept, and an initial distance. Raises
+    `CalibrationError` if the spheres are not lit or the distance is undetermined.
     """
     lit = shading.grey > 6 * np.maximum(shading.deviation, 1e-12)
     if lit.sum() < 100:
         raise CalibrationError(
-            f"light {nominal.name}: {int(lit.sum())} pixels of the diffuse sphere answer it, 100 "
-            "are needed: it is behind the sphere for every camera, dark, or too dim for the "
-            "exposure: move the sphere or expose longer"
+            f"light {nominal.name}: it lights {int(lit.sum())} visible pixels of the diffuse "
+            "sphere, expected 100 or more: move the sphere or use a longer exposure"
         )
     middle: Array = shading.centres.mean(axis=0)
     away = np.linalg.norm(nominal.position - middle) * _direction(shading, lit)
@@ -100,12 +99,12 @@ def shaded_light(nominal: Light, shading: Shading) -> CalibratedLight:
     form = shading.form(start)
     if use.sum() < 100 or not (form[use] > 0).all():
         raise CalibrationError(
-            f"light {nominal.name}: it falls on the diffuse sphere from where no camera sees it "
-            "well: move the sphere, or aim a camera at its lit side"
+            f"light {nominal.name}: no camera views the lit side of the diffuse sphere: move the "
+            "sphere, or aim a camera at its lit side"
         )
     (x, n), value, error = (a[use] for a in shading.surface), shading.grey[use], shading.error[use]
     v = start.position - x
-    # the profile changes little over the sphere and over the way to the solution
+    # the profile is nearly constant over the sphere and during the solution
     share = form[use] * (v * v).sum(axis=1) ** 1.5 / (n * v).sum(axis=1)
 
     def function(p: Array) -> tuple[Array, Array]:
@@ -121,21 +120,21 @@ def shaded_light(nominal: Light, shading: Shading) -> CalibratedLight:
     solution = minimise(function, np.append(start.position, begin))
     found = solution.x[:3]
     distance = float(np.linalg.norm(found - middle))
-    # a sphere that is taken to be off its place turns every normal on it
+    # an error of a sphere's position rotates all its normals
     worst = float(np.linalg.eigvalsh(shading.covariance)[-1]) / len(shading.centres)
     covariance = solution.covariance[:3, :3] + worst * (distance / shading.radius) ** 2 * np.eye(3)
     light = replace(start, position=found)
     out = CalibratedLight(light, covariance, float(solution.deviation[3]))
     if not out.deviation < LOOSE * distance:
         raise CalibrationError(
-            f"light {nominal.name}: shading leaves its position open by {out.deviation:.3g} m at "
-            f"{distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several places"
+            f"light {nominal.name}: its position has a standard deviation of {out.deviation:.3g} m "
+            f"at {distance:.3g} m (limit {LOOSE:.0%}): use a larger sphere, or several positions"
         )
     return with_intensity(out, shading)
 
 
 def with_intensity(known: CalibratedLight, shading: Shading) -> CalibratedLight:
-    """`known` with the intensity per channel that its place and the `shading` say."""
+    """`known` with the intensity per channel from its position and the `shading`."""
     use = shading.used(known.light)
     form, weight = shading.form(known.light)[use], shading.error[use] ** -2
     intensity = (form * weight) @ shading.radiance[use] / ((form * weight) @ form)
@@ -145,11 +144,10 @@ def with_intensity(known: CalibratedLight, shading: Shading) -> CalibratedLight:
 def refine_centres(
     lights: Mapping[str, Light], shadings: Mapping[str, Shading]
 ) -> dict[str, Shading]:
-    """`shadings` with the centres that shading and outlines agree on.
+    """`shadings` with sphere centres refined jointly from shading and outlines.
 
-    An outline's light is not equal all around, which pulls it to one side by a tenth of a pixel;
-    from cameras on several sides that contradicts the shading. Each round solves for all lights and
-    takes a Gauss-Newton step for the centres, with the lights' answer to it eliminated.
+    Uneven light around an outline biases it by a tenth of a pixel. Each round solves for all lights
+    and takes a Gauss-Newton step for the centres with the lights eliminated.
     """
     first = next(iter(shadings.values()))
     prior, centres = np.linalg.inv(first.covariance), first.centres
@@ -161,7 +159,7 @@ def refine_centres(
             try:
                 light = shaded_light(lights[name], shading).light
             except CalibrationError:
-                continue  # as the caller will find out
+                continue  # the caller reports it
             r, J = _derivatives(shading, light)
             Q, _ = np.linalg.qr(J[:, :4])
             K = J[:, 4:] - Q @ (Q.T @ J[:, 4:])
@@ -174,7 +172,7 @@ def refine_centres(
 
 
 def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
-    """Residuals `(N,)` and derivatives by the light's place, log intensity, and all centres."""
+    """Residuals `(N,)` and derivatives by the light's position, log intensity, and all centres."""
     use = shading.used(light)
     grey, error = shading.grey[use], shading.error[use]
     strength = float(light.intensity.mean())
@@ -189,7 +187,7 @@ def _derivatives(shading: Shading, light: Light) -> tuple[Array, Array]:
 
 
 def _direction(shading: Shading, lit: Bools) -> Array:
-    """The way `(3,)` to a far light: radiance = max(n·g, 0)."""
+    """Direction `(3,)` to a distant light: radiance = max(n·g, 0)."""
     normals, use, g = shading.surface[1], lit, np.asarray((0.0, 0.0, 1.0))
     for _ in range(4):
         g = np.asarray(np.linalg.lstsq(normals[use], shading.grey[use], rcond=None)[0])

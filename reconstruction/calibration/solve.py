@@ -1,4 +1,4 @@
-"""From captures of boards and spheres to a rig, with a report of what is known how well."""
+"""From captures of boards and spheres to a rig and a report of its accuracy."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from reconstruction.geometry.rig import Rig
 from reconstruction.images.silhouettes import NoSilhouette, lit_image
 from reconstruction.report.report import Progress, Report, Stage, silent
 
-OFF = 1.0  # pixels: highlights of a mirror sphere alone are met better, root mean square
+OFF = 1.0  # pixels: RMS of mirror sphere highlights above which a warning is given
 
 
 @dataclass(frozen=True)
 class TargetCaptures:
-    """What was shot: `boards`, one a pose, with `all_on` frames, and sweeps where they calibrate
-    projectors; `mirrors` and `diffuse` spheres under single lights, one a place.
+    """Captures: `boards`, one per pose, with `all_on` frames, and sweeps for projectors; `mirrors`
+    and `diffuse` spheres under single lights, one per position.
     """
 
     boards: Sequence[Capture]
@@ -44,11 +44,10 @@ class TargetCaptures:
 
 @dataclass(frozen=True)
 class Targets:
-    """What stood on the stage: the board, its paper's albedo, the spheres' radii and albedo.
+    """Calibration targets: the board, its paper's albedo, the spheres' radii (metres) and albedo.
 
-    Metres. The diffuse sphere's albedo scales all lights' intensities, the paper's all projectors';
-    None leaves the projectors' intensities nominal. Raises `CalibrationError` for a radius that is
-    no length, or an albedo out of (0, 1].
+    The diffuse sphere's albedo scales the lights' intensities, the paper's the projectors'; with
+    None the latter stay nominal. Raises `CalibrationError` for an invalid radius or albedo.
     """
 
     board: Board = Board()  # noqa: RUF009  frozen
@@ -61,7 +60,7 @@ class Targets:
         for what in ("mirror", "diffuse"):
             radius = getattr(self, f"{what}_radius")
             if not 0 < radius < np.inf:
-                raise CalibrationError(f"{what} sphere: its radius is no length, {radius} m")
+                raise CalibrationError(f"{what} sphere: expected a radius above 0, got {radius} m")
         for what, albedo in (("paper", self.paper), ("diffuse sphere", self.diffuse_albedo)):
             if albedo is not None and not 0 < albedo <= 1:
                 raise CalibrationError(
@@ -77,13 +76,11 @@ def calibrate(
     keep_lens: bool = False,
     progress: Progress = silent,
 ) -> tuple[Rig, Report]:
-    """Calibrate the rig whose devices are called as in `nominal`, and are about there.
+    """Calibrate the devices of `nominal`, starting from their approximate positions there.
 
-    Pictures are taken less their dark frames. What no capture determines stays nominal and stands
-    in the report's stages under `undetermined`.
-
-    The world is `nominal`'s: the rigid motion that fits its cameras best. Raises
-    `CalibrationError` where cameras stay open, or took pictures of another size than `nominal` has.
+    Values that no capture determines stay nominal and are listed as `undetermined` in the report's
+    stages. The world frame is aligned with `nominal`'s cameras. Raises `CalibrationError` if a
+    camera is undetermined or its images have another size than in `nominal`.
     """
     for capture in (*captures.boards, *captures.mirrors, *captures.diffuse):
         _require_size(nominal, capture)
@@ -108,14 +105,14 @@ def _require_size(nominal: Rig, capture: Capture) -> None:
         width, height = sizes.get(c.name, (c.width, c.height))
         if (width, height) != (c.width, c.height):
             raise CalibrationError(
-                f"{capture.path}: pictures of {c.name} have {width} × {height} pixels, in the "
-                f"nominal rig they have {c.width} × {c.height}: give the rig file of the stage as "
-                "it was shot, binning and all (--rig)"
+                f"{capture.path}: images of {c.name} have {width} × {height} pixels, expected "
+                f"{c.width} × {c.height} as in the nominal rig: give the rig file with the same "
+                "binning (--rig)"
             )
 
 
 def sightings(captures: Mapping[str, Capture], camera: str, board: Board) -> dict[str, Sighting]:
-    """Where `camera` sees the corners, by capture; captures without a lit frame are left out."""
+    """Corners detected in `camera` by capture; captures without a lit frame are skipped."""
     out = {}
     for name, capture in captures.items():
         try:
@@ -133,14 +130,14 @@ def _cameras(
     stage: Stage,
     progress: Progress,
 ) -> CameraSolution:
-    seen = {}
+    found_corners = {}
     for k, camera in enumerate(nominal.cameras):
         progress(f"board in {camera.name}", 0.4 * k / len(nominal.cameras))
-        seen[camera.name] = sightings(captures, camera.name, board)
-    found = calibrate_cameras(nominal.cameras, board, seen, keep_lens=keep_lens)
+        found_corners[camera.name] = sightings(captures, camera.name, board)
+    found = calibrate_cameras(nominal.cameras, board, found_corners, keep_lens=keep_lens)
     stage.figures.update(
         rms_px=found.rms,
-        captures_and_corners={k: list(v) for k, v in found.seen.items()},
+        captures_and_corners={k: list(v) for k, v in found.observations.items()},
         focal_deviation=found.focal_deviation,
         position_deviation_mm={k: 1e3 * v for k, v in found.position_deviation.items()},
         distortion={c.name: c.distortion.tolist() for c in found.cameras},
@@ -148,7 +145,7 @@ def _cameras(
     )
     for name, rms in found.rms.items():
         if rms > 0.3:
-            stage.warn(f"{name}: corners are off by {rms:.2g} px (rms): is the board flat?")
+            stage.warn(f"{name}: reprojection error {rms:.2g} px RMS: check that the board is flat")
     for text in unlike_nominal(found.cameras, nominal.cameras, board.square):
         stage.warn(text)
     return found
@@ -190,12 +187,12 @@ def _projectors(
             "turn_deviation_deg": float(np.degrees(one.turn_deviation)),
         }
     if targets.paper is None:
-        why = "without the paper's albedo"
+        why = "the paper's albedo was not given"
     else:
         values = projector_intensities(out, captures, cameras, targets.board, targets.paper)
         out = [replace(p, intensity=values[p.name]) if p.name in values else p for p in out]
         missing = [p.name for p in out if p.name not in values]
-        why = f"of {missing}: no tracking frame shows the board in their light" if missing else ""
+        why = f"{missing}: no tracking frame shows the board in their light" if missing else ""
         stage.figures["intensity"] = {k: v.tolist() for k, v in values.items()}
     if why:
         undetermined["intensity"] = f"{why}; kept as nominal"
@@ -232,15 +229,14 @@ def _lights(
         glints = glints_of(captures.mirrors, cameras, names)
         if not glints:
             raise CalibrationError(
-                "mirror sphere: no camera sees a highlight of any single light: are there OLAT "
-                "frames, and is the sphere in view?"
+                "mirror sphere: no highlight of a single light is visible in any camera: check "
+                "for OLAT frames and that the sphere is in view"
             )
         by_mirror, centres, rms = mirrored_lights(by_name, glints, targets.mirror_radius, found)
         if rms > OFF:
             stage.warn(
-                f"mirror sphere: highlights are off by {rms:.2g} px (rms): is its radius "
-                f"{1e3 * targets.mirror_radius:g} mm, and does nothing else shine, as a light that "
-                "a camera sees?"
+                f"mirror sphere: reprojection error of highlights {rms:.2g} px RMS: check that "
+                f"its radius is {1e3 * targets.mirror_radius:g} mm and that no lamp is in view"
             )
         for name, one in by_mirror.items():
             found[name] = with_intensity(one, shadings[name]) if name in found else one
@@ -252,14 +248,14 @@ def _lights(
         )
         for name in {g.light for g in glints} - set(found):
             undetermined[name] = (
-                "its highlights tell its direction but not its distance: shoot the mirror sphere "
-                "in more places, or a diffuse one"
+                "its highlights determine its direction but not its distance: capture the mirror "
+                "sphere in more positions, or a diffuse one"
             )
     for name in names:
         if name not in found:
-            undetermined.setdefault(name, "no sphere was shot under it alone")
+            undetermined.setdefault(name, "no sphere was captured under it alone")
         elif found[name].intensity_deviation is None:
-            undetermined[name] = "intensity: only mirrors showed it; kept as nominal"
+            undetermined[name] = "intensity: visible on mirror spheres only; kept as nominal"
     stage.figures.update(
         calibrated=len(found),
         position_deviation_mm={k: 1e3 * v.deviation for k, v in found.items()},

@@ -1,7 +1,7 @@
-"""Cameras from sightings of one board in many poses: each lens alone, then all together.
+"""Cameras from one board in many poses: each lens alone, then all together.
 
-Zhang's method (2000) starts every camera, shared poses tie them to one another, and a bundle
-adjustment over all lenses, cameras and board poses has the last word.
+Zhang's method (2000) initialises every camera, shared board poses connect them, and a bundle
+adjustment solves for all lenses, cameras and board poses.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from reconstruction.geometry.rigid_motion import Rigid, align_devices
 
 Sightings = Mapping[str, Mapping[str, Sighting]]
 
-LEAST = 8  # corners in a sighting
-CORNER = 0.05  # pixels: no corner is better than this
-LOOSE = 0.02  # of the focal length: a larger deviation is no calibration
+LEAST = 8  # corners in an image
+CORNER = 0.05  # pixels: standard deviation of a corner
+LOOSE = 0.02  # largest relative standard deviation of the focal length
 LENSES = ((), (0,), (0, 1), (0, 1, 2, 3))
-"""Sets of distortion numbers (k1, k2, p1, p2) that a lens may need; k3 needs wider ones."""
+"""Sets of distortion coefficients (k1, k2, p1, p2) to choose from; k3 needs wider lenses."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraSolution:
     """Calibrated `cameras`, and the board's poses `board_to_world` by capture.
 
-    By camera: `rms` of reprojection in pixels, `seen` (captures, corners), `focal_deviation`
-    relative, `position_deviation` in metres, against the camera that is named first in `rms`.
-    `residuals` holds (N, 2) pixels by camera.
+    By camera: `rms` of reprojection in pixels, `observations` (captures, corners), relative
+    `focal_deviation`, `position_deviation` in metres against the first camera, and `residuals`
+    (N, 2) in pixels.
     """
 
     cameras: tuple[Camera, ...]
     board_to_world: dict[str, Rigid]
     rms: dict[str, float]
-    seen: dict[str, tuple[int, int]]
+    observations: dict[str, tuple[int, int]]
     focal_deviation: dict[str, float]
     position_deviation: dict[str, float]
     residuals: dict[str, Array]
@@ -49,14 +49,13 @@ class CameraSolution:
 def calibrate_cameras(
     nominal: Sequence[Camera], board: Board, sightings: Sightings, *, keep_lens: bool = False
 ) -> CameraSolution:
-    """Calibrate the cameras called as in `nominal` from `sightings[camera][capture]`.
+    """Calibrate the cameras of `nominal` from `sightings[camera][capture]`.
 
-    `nominal` gives sizes and, by the rigid motion that fits it best, the world's frame; with
-    `keep_lens` it also gives K and distortion, and one pose of the board is enough. Lengths are
-    the board's.
+    `nominal` gives image sizes and, by the best rigid alignment, the world frame; with `keep_lens`
+    also K and distortion, and one board pose suffices. Lengths are the board's.
 
-    Raises `CalibrationError` where a camera has not seen the board, where the poses of the board do
-    not determine its lens, and where no pose ties cameras together.
+    Raises `CalibrationError` if a camera has no view of the board, the board poses do not determine
+    its lens, or no pose connects cameras.
     """
     usable = {c.name: _usable(c, board, sightings.get(c.name, {}), keep_lens) for c in nominal}
     if keep_lens:
@@ -68,27 +67,27 @@ def calibrate_cameras(
 
 
 def _usable(
-    camera: Camera, board: Board, seen: Mapping[str, Sighting], keep_lens: bool
+    camera: Camera, board: Board, sightings: Mapping[str, Sighting], keep_lens: bool
 ) -> dict[str, Sighting]:
     out = {
         pose: s
-        for pose, s in seen.items()
+        for pose, s in sightings.items()
         if len(s) >= LEAST
         and not board._opencv.checkCharucoCornersCollinear(s.ids.astype(np.int32)[:, None])
     }
     need = 1 if keep_lens else 3
     if len(out) < need:
         raise CalibrationError(
-            f"{camera.name}: sees {LEAST} or more corners of the board in {len(out)} of the "
-            f"captures, its lens and pose need {need}"
+            f"{camera.name}: {LEAST} or more corners of the board are visible in {len(out)} "
+            f"captures, expected {need}"
             + (" at different tilts" if need > 1 else "")
-            + ": shoot the board nearer to it, larger in its picture, or check the board's numbers"
+            + ": capture the board closer to it, or check the board's dimensions"
         )
     return out
 
 
 def _upright(camera: Camera, sighting: Sighting) -> Sighting:
-    """What a camera of no skew would have seen: OpenCV knows no other."""
+    """Pixels of a camera without skew, which OpenCV does not model."""
     _, skew, _, _, fy, cy = camera.K[:2].ravel()
     return replace(
         sighting, pixels=sighting.pixels - np.outer((sighting.pixels[:, 1] - cy) / fy, (skew, 0))
@@ -97,7 +96,7 @@ def _upright(camera: Camera, sighting: Sighting) -> Sighting:
 
 @dataclass(frozen=True, eq=False)
 class _Lens:
-    """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, which of them are estimated, and a kept skew."""
+    """fx, fy, cx, cy, k1, k2, p1, p2, k3 `(9,)`, indices of the free ones, and a fixed skew."""
 
     values: Array
     free: Ints
@@ -114,10 +113,10 @@ class _Lens:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Lens:
-    """The lens with as many numbers as the sightings bear out (Bayesian information criterion)."""
-    corners = [board.corners[s.ids].astype(np.float32) for s in seen.values()]
-    pixels = [s.pixels.astype(np.float32) for s in seen.values()]
+def _one_lens(camera: Camera, board: Board, sightings: Mapping[str, Sighting]) -> _Lens:
+    """The lens with the number of coefficients of the best Bayesian information criterion."""
+    corners = [board.corners[s.ids].astype(np.float32) for s in sightings.values()]
+    pixels = [s.pixels.astype(np.float32) for s in sightings.values()]
     count = 2 * sum(len(p) for p in pixels)
     best: tuple[float, _Lens] | None = None
     for lens in LENSES:
@@ -130,7 +129,7 @@ def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Le
                 corners, pixels, (camera.width, camera.height), None, None, flags=fixed
             )
         except cv2.error:
-            continue  # as below: a lens that these poses leave open
+            continue  # undetermined by these poses
         if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0):
             continue
         score = count * np.log(max(rms, 0.2 * CORNER) ** 2) + len(lens) * np.log(count)
@@ -138,24 +137,24 @@ def _one_lens(camera: Camera, board: Board, seen: Mapping[str, Sighting]) -> _Le
             values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], bent.ravel()[:5]])
             best = score, _Lens(values, np.array([0, 1, 2, 3, *(4 + k for k in lens)]))
     if best is None:
-        raise _open_lens(camera.name, len(seen), np.inf)
+        raise _open_lens(camera.name, len(sightings), np.inf)
     return best[1]
 
 
 def _open_lens(name: str, poses: int, deviation: float) -> CalibrationError:
     known = f"known to {deviation:.1%} (limit {LOOSE:.0%})" if deviation < 1 else "not determined"
     return CalibrationError(
-        f"{name}: {poses} poses of the board leave the lens open: its focal length is {known}: "
-        "tilt the board by 30° or more in several directions, or keep the nominal lens"
+        f"{name}: {poses} poses of the board do not determine the lens, its focal length is "
+        f"{known}: tilt the board by 30° or more in several directions, or keep the nominal lens"
     )
 
 
 def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid | None:
-    """Board to camera; None where the lens is none that could show it so."""
-    seen = board.corners[sighting.ids], sighting.pixels, lens.matrix(), lens.values[4:]
-    found, turn, shift = cv2.solvePnP(*seen, flags=cv2.SOLVEPNP_IPPE)
+    """Board to camera; None if no pose reproduces the corners."""
+    data = board.corners[sighting.ids], sighting.pixels, lens.matrix(), lens.values[4:]
+    found, turn, shift = cv2.solvePnP(*data, flags=cv2.SOLVEPNP_IPPE)
     if found:
-        found, turn, shift = cv2.solvePnP(*seen, turn, shift, useExtrinsicGuess=True)
+        found, turn, shift = cv2.solvePnP(*data, turn, shift, useExtrinsicGuess=True)
     if not (found and np.isfinite([turn, shift]).all()):
         return None
     return Rigid(cv2.Rodrigues(turn)[0], shift.ravel())
@@ -164,9 +163,9 @@ def _pose(lens: _Lens, board: Board, sighting: Sighting) -> Rigid | None:
 def _chain(
     board: Board, usable: Mapping[str, Mapping[str, Sighting]], lenses: Sequence[_Lens]
 ) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """World-to-camera and board-to-world poses: the first camera is the world.
+    """World-to-camera and board-to-world poses in the first camera's frame.
 
-    A tree over the sightings, those with most corners first (Prim).
+    By a spanning tree over the sightings, most corners first (Prim).
     """
     edges = {}
     for (name, seen), lens in zip(usable.items(), lenses, strict=True):
@@ -187,14 +186,14 @@ def _chain(
             cameras[name] = edges[name, pose] @ boards[pose].inverse()
     if apart := sorted(set(usable) - set(cameras)):
         raise CalibrationError(
-            f"no capture of the board ties {apart} to {sorted(cameras)}: shoot poses that a camera "
-            "of each group sees"
+            f"no capture of the board connects {apart} to {sorted(cameras)}: capture poses visible "
+            "to a camera of each group"
         )
     return cameras, boards
 
 
 class _Bundle:
-    """Residuals of all corners with their derivatives: lenses, cameras but the first, boards."""
+    """Residuals of all corners and derivatives by lenses, cameras but the first, and boards."""
 
     def __init__(
         self,
@@ -207,7 +206,7 @@ class _Bundle:
         self.poses = sorted({p for seen in usable.values() for p in seen})
         ends = np.cumsum([0] + [len(lens.free) for lens in lenses])
         self.lens_at = [np.arange(a, b) for a, b in pairwise(ends)]
-        self.cameras_from = int(ends[-1]) - 6  # the first camera is the world
+        self.cameras_from = int(ends[-1]) - 6  # the first camera is fixed
         self.boards_from = self.cameras_from + 6 * len(self.names)
         self.size = self.boards_from + 6 * len(self.poses)
         self.count = 2 * sum(len(s) for seen in usable.values() for s in seen.values())
@@ -225,21 +224,21 @@ class _Bundle:
         return x
 
     def camera_at(self, k: int) -> Ints:
-        """Where camera number `k` > 0 has its pose."""
+        """Parameter indices of the pose of camera `k` > 0."""
         return np.arange(6) + self.cameras_from + 6 * k
 
     def board_at(self, k: int) -> Ints:
-        """Where board number `k` has its pose."""
+        """Parameter indices of the pose of board `k`."""
         return np.arange(6) + self.boards_from + 6 * k
 
     def lens(self, x: Array, k: int) -> _Lens:
-        """Camera number `k`'s lens at the parameters `x`."""
+        """The lens of camera `k` at the parameters `x`."""
         values = self.lenses[k].values.copy()
         values[self.lenses[k].free] = x[self.lens_at[k]]
         return replace(self.lenses[k], values=values)
 
     def camera_pose(self, x: Array, k: int) -> Rigid:
-        """World to camera number `k`."""
+        """World to camera `k`."""
         return Rigid.identity() if k == 0 else Rigid.from_vector(x[self.camera_at(k)])
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
@@ -283,7 +282,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
         try:
             found.append(replace(c, K=K, R=R, t=t, distortion=lens.values[4:]))
         except ValueError as error:
-            advice = "shoot the board into the corners of its picture"
+            advice = "capture the board in the corners of its image"
             raise CalibrationError(f"{error}: {advice}") from error
     frame = align_devices(found, nominal)
     residuals, row = {}, 0
@@ -297,7 +296,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
             p: frame @ Rigid.from_vector(x[bundle.board_at(k)]) for k, p in enumerate(bundle.poses)
         },
         rms={n: float(np.sqrt((r**2).sum(axis=1).mean())) for n, r in residuals.items()},
-        seen={n: (len(s), sum(map(len, s.values()))) for n, s in bundle.usable.items()},
+        observations={n: (len(s), sum(map(len, s.values()))) for n, s in bundle.usable.items()},
         focal_deviation=focal,
         position_deviation={
             n: 0.0 if k == 0 else _position_deviation(solution, bundle.camera_at(k))
@@ -308,7 +307,7 @@ def _result(bundle: _Bundle, solution: Solution, nominal: Sequence[Camera]) -> C
 
 
 def _position_deviation(solution: Solution, at: Ints) -> float:
-    """Metres, from the covariance of rotation vector and translation."""
+    """Standard deviation of the position, metres."""
     C = solution.covariance[np.ix_(at, at)]
     _, J = numeric(lambda v: Rigid.from_vector(v).inverse().translation)(solution.x[at])
     return float(np.sqrt(np.trace(J @ C @ J.T)))

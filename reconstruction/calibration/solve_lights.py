@@ -1,8 +1,7 @@
-"""Lights from highlights on mirror spheres, with what was known of them before.
+"""Lights from highlights on mirror spheres, combined with the result of diffuse spheres.
 
-A highlight is a direction from the sphere, sharp but with the base line of the spheres alone for a
-distance. The shading of diffuse spheres (`shading`) knows distances; its answers, with their
-covariance, join the bundle adjustment of all highlights.
+Highlights give accurate directions; distances only by the baseline between spheres. The positions
+from shading, with their covariance, are priors in the bundle adjustment of all highlights.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from reconstruction.calibration.spheres import Highlight, crossing, mirrored
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 
-LOOSE = 0.05  # of the distance: a larger deviation is no position
-SAME_PLACE = np.radians(0.5)  # between rays that are to cross
+LOOSE = 0.05  # largest standard deviation of a position relative to the distance
+SAME_PLACE = np.radians(0.5)  # angle between rays that intersect reliably
 
 
 @dataclass(frozen=True, eq=False)
 class Glint:
-    """`highlight` of `light` that `camera` sees on mirror sphere number `sphere`."""
+    """`highlight` of `light` on mirror sphere number `sphere` in `camera`."""
 
     light: str
     camera: Camera
@@ -38,8 +37,8 @@ class Glint:
 class CalibratedLight:
     """A calibrated `light` with the `covariance (3, 3)` of its position, m².
 
-    `intensity_deviation` is relative; None where only mirrors showed the light and the intensity
-    is nominal.
+    `intensity_deviation` is relative; None if only mirror spheres were used and the intensity is
+    nominal.
     """
 
     light: Light
@@ -48,7 +47,7 @@ class CalibratedLight:
 
     @property
     def deviation(self) -> float:
-        """Of the position along its worst direction, metres."""
+        """Standard deviation of the position in its worst direction, metres."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
 
@@ -58,13 +57,11 @@ def mirrored_lights(
     radius: float,
     known: Mapping[str, CalibratedLight],
 ) -> tuple[dict[str, CalibratedLight], Array, float]:
-    """Lights from highlights on mirror spheres of `radius`; `known` is what shading said of them.
+    """Lights from highlights on mirror spheres of `radius`; `known` are results of shading.
 
-    Solves for all lights and the spheres' centres at once, by reprojection of the highlights.
-    Returns lights whose position is found to `LOOSE`, the centres `(S, 3)`, and the highlights' rms
-    in pixels.
-
-    Raises `CalibrationError` where a sphere cannot be placed: fewer than two viewpoints.
+    Solves for all lights and sphere centres by the reprojection error of the highlights. Returns
+    lights with positions accurate to `LOOSE`, the centres `(S, 3)`, and the RMS in pixels. Raises
+    `CalibrationError` for a sphere visible from fewer than two viewpoints.
     """
     names = sorted({g.light for g in glints})
     spheres = 1 + max(g.sphere for g in glints)
@@ -87,7 +84,7 @@ def mirrored_lights(
             out[k] = (cameras[name].project(at[k])[0] - pixel[k]) / error[k, None]
         return out.ravel()
 
-    # what shading knew: rows that weigh a light's change by the root of its information
+    # priors from shading: rows weighted by the root of their information
     priors = [
         (k, known[n].light.position, np.linalg.cholesky(np.linalg.inv(known[n].covariance)).T)
         for k, n in enumerate(names)
@@ -98,7 +95,7 @@ def mirrored_lights(
         r, h = residual(x), 1e-6
         row = np.arange(2 * len(glints))
         entries = []
-        # no highlight shares its light or sphere with another's parameters: step them all at once
+        # each highlight depends on one light and one sphere: differentiate all at once
         for owner, offset, size in ((which, 0, count), (sphere, count, len(x) - count)):
             for axis in range(3):
                 step = np.zeros_like(x)
@@ -144,9 +141,10 @@ def _calibrated(
 
 
 def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
-    """About where a mirror sphere is: a far light's image stands half a radius before its centre.
+    """Approximate centre of a mirror sphere.
 
-    So the crossings of the rays to each light's highlight lie on a sphere of half the radius.
+    A distant light's image lies half a radius before the centre, so the intersections of the rays
+    to each light's highlight lie on a sphere of half the radius.
     """
     images = []
     widest = 0.0
@@ -162,8 +160,8 @@ def _place(glints: Sequence[Glint], sphere: int, radius: float) -> Array:
     if not images:
         who = sorted({g.camera.name for g in mine})
         raise CalibrationError(
-            f"mirror sphere {sphere + 1}: no light's highlight is seen from two places ({who}, "
-            f"{np.degrees(widest):.2g}° apart at most): a second camera must see it"
+            f"mirror sphere {sphere + 1}: no highlight is visible from two viewpoints ({who}, at "
+            f"most {np.degrees(widest):.2g}° apart): place it in view of a second camera"
         )
     v = np.array(images)
     if len(v) < 6:
@@ -183,7 +181,7 @@ def _begin(
     centres: Array,
     radius: float,
 ) -> Array:
-    """Where to begin `(L, 3)`: along the mean mirrored ray, as far as nominal."""
+    """Initial positions `(L, 3)`: along the mean mirrored ray at the nominal distance."""
     out: Array = np.empty((len(names), 3))
     for k, name in enumerate(names):
         if name in known:

@@ -1,10 +1,9 @@
-"""Projectors as inverse cameras: the rows that a sweep decodes on a board in known poses.
+"""Projectors as inverse cameras, from the rows of a sweep decoded on a board in known poses.
 
-A sweep of rows says one coordinate of two. The planes of light of a pinhole projector all hold one
-line, its x axis through its centre, and the seven numbers that rows determine are that line (4),
-and row against angle about it (3: focal length and principal point along y, and the turn). Where
-along the line the centre is, and the focal length and principal point along x, no row tells: they
-stay as nominal, relative to the device, and change no plane of light.
+Rows give one coordinate. All planes of light of a pinhole projector contain its x axis through its
+centre; rows determine that line (4 parameters) and row against angle about it (3: focal length and
+principal point along y, and the rotation). The centre's position along the line, and focal length
+and principal point along x, stay nominal; no plane of light depends on them.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ from reconstruction.geometry.rigid_motion import Rigid
 from reconstruction.images.silhouettes import dark_response
 from reconstruction.light_planes.peaks import find_peaks
 
-MOST = 20_000  # points: more do not make it better
-HEAD = 0.1  # metres about the points' middle where planes of light are to be right
-LOOSE = 2e-3  # metres: where planes are known to no better there, that is no calibration
+MOST = 20_000  # points used
+HEAD = 0.1  # metres: radius around the points' middle where planes are evaluated
+LOOSE = 2e-3  # metres: largest standard deviation of planes there
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedRows:
-    """Points `points (N, 3)` of the world, their rows `row (N,)` and deviations `(N,)`, in rows."""
+    """World `points (N, 3)`, their `row (N,)` and its `deviation (N,)`, in rows."""
 
     points: Array
     row: Array
@@ -41,7 +40,7 @@ class DecodedRows:
 
     @classmethod
     def join(cls, parts: Sequence[DecodedRows]) -> DecodedRows:
-        """All of them; at most `MOST`, evenly taken."""
+        """Concatenated and thinned to `MOST`."""
         if not parts:
             return cls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
         columns = zip(*((p.points, p.row, p.deviation) for p in parts), strict=True)
@@ -54,8 +53,8 @@ class DecodedRows:
 class ProjectorSolution:
     """The calibrated `projector`; `points` used; `rms` of the rows' residuals, rows.
 
-    `plane_deviation` (metres) is of the planes of light, at its largest within `HEAD` of the
-    points' middle; `axis_deviation` (metres) of the line that all of them hold, `turn_deviation`
+    Standard deviations: `plane_deviation` (metres) of the planes of light, the largest within
+    `HEAD` of the points' middle; `axis_deviation` (metres) of their common line; `turn_deviation`
     (radians) of the rotation.
     """
 
@@ -68,18 +67,17 @@ class ProjectorSolution:
 
 
 UNDETERMINED = (
-    "the centre's place along the projector's x axis, K[0, 0], K[0, 1], K[0, 2]: rows say nothing "
-    "of them, and no plane of light depends on them; kept as nominal"
+    "the centre's position along the projector's x axis, K[0, 0], K[0, 1], K[0, 2]: rows do not "
+    "determine them and no plane of light depends on them; kept as nominal"
 )
 
 
 def rows_on_board(
     capture: Capture, camera: Camera, projector: str, board: Board, board_to_world: Rigid
 ) -> DecodedRows:
-    """What `camera`, calibrated, decodes of `projector`'s sweep on the board, one point a pixel.
+    """Rows of `projector`'s sweep on the board decoded by a calibrated `camera`, one per pixel.
 
-    Pixels that see an edge of the print are left out: the line's centre of light is not its centre
-    there. So are saturated ones.
+    Saturated pixels and pixels on an edge of the print, which bias the peak, are excluded.
     """
     peaks = find_peaks(capture, camera.name, projector)
     first = np.unique(peaks.pixel @ (1, camera.width), return_index=True)[1]
@@ -98,18 +96,18 @@ def rows_on_board(
 
 
 def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolution:
-    """The projector whose planes of light meet `rows`, in the world of the points.
+    """The projector that fits `rows`, in the frame of the points.
 
-    `nominal` gives the size, the line's width, intensity and what rows leave open.
-
-    Raises `CalibrationError` where too few points are there or all of them lie in one plane: that
-    leaves two of the seven numbers open.
+    `nominal` gives size, line width, intensity and the parameters that rows do not determine.
+    Raises `CalibrationError` for too few or coplanar points, which determine only five of seven
+    parameters.
     """
     where = f"projector {nominal.name}"
     if len(rows.row) < 50:
         raise CalibrationError(
-            f"{where}: {len(rows.row)} points of the board decode, 50 are needed: is the sweep in "
-            "the board captures, and does its light reach the board's printed side?"
+            f"{where}: {len(rows.row)} points were decoded on the board, expected 50 or "
+            "more: check "
+            "that the board captures have a sweep and that it reaches the printed side"
         )
 
     def residual(x: Array) -> Array:
@@ -121,9 +119,9 @@ def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolut
     loose = _plane_deviation(nominal, solution, rows.points.mean(axis=0))
     if not loose < LOOSE:
         raise CalibrationError(
-            f"{where}: {len(rows.row)} decoded points leave its planes of light open by "
+            f"{where}: {len(rows.row)} decoded points determine its planes of light to "
             f"{loose * 1e3:.3g} mm within {HEAD * 1e3:g} mm of the board's middle (limit "
-            f"{LOOSE * 1e3:g} mm): {_shape(rows.points)}; shoot the sweep on boards at several "
+            f"{LOOSE * 1e3:g} mm): {_shape(rows.points)}; capture the sweep on boards at several "
             "distances and tilts"
         )
     rms = float(np.sqrt(np.mean((solution.residual * rows.deviation) ** 2)))
@@ -133,7 +131,7 @@ def calibrate_projector(nominal: Projector, rows: DecodedRows) -> ProjectorSolut
 
 
 def _plane_deviation(nominal: Projector, solution: Solution, middle: Array) -> float:
-    """Metres, the largest over a ball about `middle`."""
+    """Largest standard deviation over a ball around `middle`, metres."""
     way = np.random.default_rng(0).standard_normal((200, 3))
     points = middle + HEAD * way / np.linalg.norm(way, axis=1, keepdims=True)
 
@@ -156,9 +154,9 @@ def projector_intensities(
 ) -> dict[str, Array]:
     """Radiant intensities `(3,)` from the tracking frames (all projectors on), W/sr per channel.
 
-    The print is Lambertian; its paper has the albedo `white`, its ink any. A pixel's light is the
-    sum over projectors of albedo / π · I · cosine / distance², of paper and of ink by their shares
-    of the pixel, which non-negative least squares tells apart.
+    The print is Lambertian; its paper has the albedo `white`, its ink an unknown one. A pixel's
+    radiance is the sum over projectors of albedo / π · I · cosine / distance², of paper and ink by
+    their shares of the pixel; both are solved by non-negative least squares.
     """
     rows: list[Array] = []
     values: list[Array] = []
@@ -188,7 +186,7 @@ def projector_intensities(
 
 
 def _printed(camera: Camera, board: Board, to_world: Rigid) -> tuple[Ints, Array, Array]:
-    """Pixels `(N, 2)` that see the print, points `(N, 3)` there, and each one's share of paper."""
+    """Pixels `(N, 2)` on the print, points `(N, 3)` there, and each pixel's share of paper."""
     to_board = to_world.inverse()
     origin = to_board(camera.center)
     y, x = np.mgrid[0 : camera.height : 2, 0 : camera.width : 2]
@@ -198,7 +196,7 @@ def _printed(camera: Camera, board: Board, to_world: Rigid) -> tuple[Ints, Array
     sub = (np.arange(4) + 0.5) / 4 - 0.5
     offsets = np.stack(np.meshgrid(sub, sub), axis=-1).reshape(-1, 2)
     rays = camera.rays(pixels[:, None] + offsets) @ to_world.rotation
-    ahead = (rays[..., 2] > 0.2).all(axis=1)  # flatter, a card shines
+    ahead = (rays[..., 2] > 0.2).all(axis=1)  # at grazing angles paper is glossy
     pixels, rays = pixels[ahead], rays[ahead]
     at = origin - (origin[2] / rays[..., 2:]) * rays
     inside = ((at[..., :2] > 0) & (at[..., :2] < board.size)).all(axis=(1, 2))
@@ -207,7 +205,7 @@ def _printed(camera: Camera, board: Board, to_world: Rigid) -> tuple[Ints, Array
 
 
 def _sure(projectors: Sequence[Projector], points: Array) -> Bools:
-    """Points well inside of each beam or well outside: rows do not say where its sides are."""
+    """Points clearly inside or outside each beam, whose sides rows do not determine."""
     sure = np.ones(len(points), bool)
     for p in projectors:
         at, depth = p.project(points)
@@ -241,7 +239,7 @@ def _projector(nominal: Projector, x: Array) -> Projector:
 
 
 def _linear(nominal: Projector, rows: DecodedRows) -> Array:
-    """The parameters that `rows` give by the direct linear transform; nominal where it is weak."""
+    """Parameters from `rows` by the direct linear transform; nominal if ill-conditioned."""
     start = np.array([0.0, 0, 0, 0, 0, 0, nominal.K[1, 2]])
     middle = rows.points.mean(axis=0)
     size = np.abs(rows.points - middle).max()
@@ -251,7 +249,7 @@ def _linear(nominal: Projector, rows: DecodedRows) -> Array:
     A = np.column_stack([X, -v[:, None] * X]) / rows.deviation[:, None]
     _, values, vt = np.linalg.svd(A, full_matrices=False)
     if values[-2] < 3 * max(values[-1], 1e-9 * values[0]):
-        return start  # the points lie in one plane, or nearly: the deviations will tell
+        return start  # nearly coplanar points: the deviations show it
     a, c = vt[-1][:4], vt[-1][4:]
     a = dv * a + v0 * c
     # to metres about the world's origin
@@ -276,4 +274,4 @@ def _linear(nominal: Projector, rows: DecodedRows) -> Array:
 
 def _shape(points: Array) -> str:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    return f"the points spread over {', '.join(f'{s * 1e3:.3g}' for s in spread)} mm (deviation)"
+    return f"the points extend over {', '.join(f'{s * 1e3:.3g}' for s in spread)} mm (deviation)"

@@ -1,4 +1,4 @@
-"""What captures of spheres say of each light: shading samples and highlights."""
+"""Shading samples and highlights of each light from captures of spheres."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from reconstruction.images.silhouettes import (
 
 Samples = tuple[Array, Array, Ints, Array, Array]
 
-MOST = 4000  # pixels of a camera
-RIM = 0.35  # cosine to the viewer below which a pixel's mean is not its middle
+MOST = 4000  # pixels per camera
+RIM = 0.35  # least cosine to the viewer of a sample
 
 
 def gather_shading(
@@ -35,10 +35,10 @@ def gather_shading(
     lights: Sequence[str],
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Shading]:
-    """Samples of a diffuse sphere in the places of `captures`, by light; `radius` in metres.
+    """Samples by light of a diffuse sphere, one position per capture; `radius` in metres.
 
-    The sphere's place is found from its outline in the lit frames; `warn` is told of outlines that
-    have another radius. Raises `CalibrationError` where a capture shows none.
+    The sphere is located by its outline in the lit frames; `warn` is called for outlines of another
+    radius. Raises `CalibrationError` for a capture without an outline.
     """
     found: dict[str, list[Samples]] = {name: [] for name in lights}
     centres, covariances = [], []
@@ -53,9 +53,9 @@ def gather_shading(
         centre, covariance, other = sphere_centre(cameras, outlines, radius, where)
         if other is not None:
             warn(
-                f"{where}: its outlines are those of a radius of {1e3 * other:.1f} mm, not of "
-                f"{1e3 * radius:g} mm: by 1 % of it, lights come out 10 % too near or too far, and "
-                "a quarter too dim or too bright: measure the sphere (--diffuse-radius-mm)"
+                f"{where}: its outlines have a radius of {1e3 * other:.1f} mm, expected "
+                f"{1e3 * radius:g} mm: measure the sphere (--diffuse-radius-mm); 1 % of the radius "
+                "is about 10 % of a light's distance"
             )
         centres.append(centre)
         covariances.append(covariance)
@@ -89,7 +89,7 @@ def gather_shading(
 def glints_of(
     captures: Sequence[Capture], cameras: Sequence[Camera], lights: Sequence[str]
 ) -> list[Glint]:
-    """Highlights on a mirror sphere in the places of `captures`, of every camera and light."""
+    """Highlights on a mirror sphere, one position per capture, of every camera and light."""
     out = []
     for (number, capture), c, name in product(enumerate(captures), cameras, lights):
         if capture.has_light(name, c.name):
@@ -101,7 +101,7 @@ def glints_of(
 
 
 def _disc(camera: Camera, centre: Array, radius: float) -> tuple[Ints, Array]:
-    """Pixels `(N, 2)` well inside the sphere's picture, and their rays `(N, 3)`."""
+    """Pixels `(N, 2)` well inside the sphere's image, and their rays `(N, 3)`."""
     box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
     at, depth = camera.project(centre + radius * box)
     if not (depth > 0).all():

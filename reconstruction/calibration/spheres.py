@@ -1,4 +1,4 @@
-"""What cameras see of a sphere: its outline, and the highlights of a mirror one."""
+"""A sphere in images: its outline, and highlights of a mirror sphere."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from reconstruction.calibration.least_squares import minimise, numeric
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import background_noise
 
-RIM = 0.2  # pixels: what a point of the outline is off by
-SPOT = 0.3  # pixels: a highlight within one pixel, anywhere in it
+RIM = 0.2  # pixels: error of an outline point
+SPOT = 0.3  # pixels: error of a highlight within one pixel
 OTHER_RADIUS = 0.01
-"""A radius is another than the outlines' by more than this share of it, and 2.5 times `RIM`."""
+"""Relative difference of the outlines' radius that is reported, if also above 2.5 times `RIM`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Highlight:
-    """A light's mirror image: its centre `pixel (2,)`, and `deviation` of it in pixels."""
+    """A light's mirror image: its centre `pixel (2,)` and standard `deviation` in pixels."""
 
     pixel: Array
     deviation: float
@@ -32,8 +32,8 @@ class Highlight:
 def find_outline(image: AnyFloats) -> Array:
     """Sub-pixel points `(N, 2)` of the rim of the one lit blob in a dark-subtracted grey `image`.
 
-    Along 120 rays from its centroid, where the light falls to half of what it is two pixels inside.
-    Directions in which the rim is dark are left out; none where nothing is lit.
+    Along 120 rays from its centroid, at half of the value two pixels inside. Directions with a dark
+    rim are skipped; empty if nothing is lit.
     """
     noise, bright = background_noise(image), float(np.percentile(image, 99))
     lit = image > max(6 * noise, 0.05 * bright)
@@ -73,20 +73,19 @@ def sphere_centre(
 ) -> tuple[Array, Array, float | None]:
     """Centre `(3,)` of a sphere of `radius` (metres) from its `outlines`, and covariance `(3, 3)`.
 
-    Rays through the outline pass the centre at one radius; how far outside of the rim all outlines
-    are found is solved for, too, or it would be taken for depth. Where that is further than rims
-    are found off, the third is the radius that the outlines have, else None. One camera suffices,
-    but tells no radius; the more, the better the depth. Raises `CalibrationError` naming `what`
-    where no camera has an outline.
+    Rays through the outline are tangent to the sphere; a common offset of all outlines is solved as
+    well, since it would bias the depth. If the offset exceeds the error of outlines, the third
+    result is their radius, else None. One camera suffices but does not determine the radius. Raises
+    `CalibrationError` naming `what` if no camera has an outline.
     """
-    seen = [c for c in cameras if len(outlines.get(c.name, ())) >= 20]
-    if not seen:
+    used = [c for c in cameras if len(outlines.get(c.name, ())) >= 20]
+    if not used:
         raise CalibrationError(
-            f"{what}: no camera sees the sphere's outline lit: is it in view in the all_on frame, "
-            "in front of a dark background?"
+            f"{what}: no camera shows the sphere's lit outline: check that it is in view in the "
+            "all_on frame, in front of a dark background"
         )
     eyes, rays, sizes, start = [], [], [], []
-    for c in seen:
+    for c in used:
         w = c.rays(outlines[c.name])
         axis = w.mean(axis=0) / np.linalg.norm(w.mean(axis=0))
         angle = float(np.median(np.arccos(np.clip(w @ axis, -1, 1))))
@@ -109,9 +108,10 @@ def sphere_centre(
 
 
 def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:
-    """The brightest spot of a dark-subtracted grey `image (H, W)`, None where all is noise.
+    """The brightest spot of a dark-subtracted grey `image (H, W)`, None if all is noise.
 
-    Its centre is the mean of its pixels by brightness. A saturated spot's deviation grows with it.
+    Its centre is the brightness-weighted mean; the deviation of a saturated spot grows with its
+    size.
     """
     noise, peak = background_noise(image), float(image.max())
     if peak <= max(8 * noise, 0):
@@ -130,10 +130,10 @@ def find_highlight(image: AnyFloats, saturated: Bools) -> Highlight | None:
 
 
 def mirrored(eyes: Array, lights: Array, centres: Array, radius: float) -> Array:
-    """Points `(N, 3)` of mirror spheres at `centres` where `eyes` see `lights` (all `(N, 3)`).
+    """Reflection points `(N, 3)` of `lights` for `eyes` on mirror spheres at `centres (N, 3)`.
 
-    The normal halves the angle between the ways to eye and light: iterated, each round is nearer by
-    about radius / distance. A light behind the sphere gives a point beyond the rim.
+    The normal bisects the directions to eye and light; each iteration reduces the error by about
+    radius / distance. A light behind the sphere gives a point beyond the rim.
     """
     n = _unit(_unit(eyes - centres) + _unit(lights - centres))
     for _ in range(40):
@@ -143,7 +143,7 @@ def mirrored(eyes: Array, lights: Array, centres: Array, radius: float) -> Array
 
 
 def crossing(eyes: Array, rays: Array) -> tuple[Array, float]:
-    """The point `(3,)` nearest to lines `(N, 3)`, and the widest angle between two, radians."""
+    """The point `(3,)` nearest to lines `(N, 3)`, and the largest angle between two, radians."""
     rejection = np.eye(3) - rays[:, :, None] * rays[:, None]
     A = rejection.sum(axis=0)
     b = np.einsum("nij,nj->i", rejection, eyes)

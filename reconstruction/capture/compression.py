@@ -1,4 +1,4 @@
-"""Compressing a finished capture, frame by frame, without a moment at which it is not whole."""
+"""Lossless compression of a finished capture; the capture stays readable at every moment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from dataclasses import replace
 from io import FileIO
 from pathlib import Path
 
-from reconstruction.capture.folder import Capture, CaptureError, FrameRecord
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError, FrameRecord
 from reconstruction.capture.writer import (
     JournalInUse,
     append_lines,
@@ -24,17 +25,16 @@ from reconstruction.report.report import Progress, silent
 ATTRIBUTES = ("exposureTime", "fullScale", "countScale")
 POLL_S = 0.2
 TOGETHER = 4
-"""Frames that are compressed at the same time: while one waits for the disk, others go on."""
+"""Frames compressed in parallel."""
 
 
 def compress(path: str | Path, progress: Progress = silent) -> int:
-    """Rewrite the uncompressed frames of a capture with ZIP, losslessly; returns the bytes saved.
+    """Rewrite the uncompressed frames of a capture with ZIP; returns the bytes saved.
 
-    `TOGETHER` frames at a time get new names, then journal lines, and only then are the old files
-    removed, so a crash leaves the capture whole; run it again to go on, and to remove what the
-    crash left over. Waits while somebody else writes or compresses the capture. Raises
-    `CaptureError` for a frame whose checksum is wrong (compression must not make damage look
-    sound), `DiskFull`.
+    `TOGETHER` frames at a time are written under new names, then listed in the journal, then the
+    old files are removed, so a crash loses nothing; a second run continues and cleans up. Waits
+    while another process has the capture open. Raises `CaptureError` for a frame with a wrong
+    checksum, and `DiskFull`.
     """
     path = Path(path)
     _finished(path)
@@ -53,7 +53,9 @@ def compress(path: str | Path, progress: Progress = silent) -> int:
 def _finished(path: Path) -> Capture:
     capture = Capture(path)
     if capture.manifest is None:
-        raise CaptureError(f"{path}: not finished; compress a capture after its manifest is there")
+        raise CaptureError(
+            f"{path}: not finished (no manifest.json): compress it after the capture has ended"
+        )
     return capture
 
 
@@ -61,7 +63,7 @@ def _journal_to_ourselves(path: Path, progress: Progress) -> FileIO:
     while True:
         try:
             return open_journal(path)
-        except JournalInUse:  # no blocking call: `progress` is where a job hears that it is ended
+        except JournalInUse:  # no blocking lock: `progress` raises when the job is cancelled
             progress("waiting for another compression of this capture", 0.0)
             time.sleep(POLL_S)
 
@@ -69,7 +71,7 @@ def _journal_to_ourselves(path: Path, progress: Progress) -> FileIO:
 def _compress(
     capture: Capture, records: Sequence[FrameRecord], journal: FileIO, pool: ThreadPoolExecutor
 ) -> int:
-    """Compress some frames, or end what a crash interrupted; returns the bytes saved."""
+    """Compress some frames, or remove leftovers of a crash; returns the bytes saved."""
     todo: list[tuple[FrameRecord, Path, Path]] = []
     for record in records:
         current = capture.file_of(record)
@@ -79,7 +81,7 @@ def _compress(
         else:
             todo.append((record, old, new))
     size = sum(old.stat().st_size for _, old, _ in todo)
-    require_free(capture.path, size, reserve=0)  # less is needed soon
+    require_free(capture.path, size, reserve=0)  # temporary
     running = [pool.submit(_compressed, capture, *each) for each in todo]
     wait(running)
     try:
@@ -96,9 +98,11 @@ def _compress(
 
 
 def _compressed(capture: Capture, record: FrameRecord, old: Path, new: Path) -> FrameRecord:
-    """The record of the frame `old` as it is written to `new`."""
+    """Compress the frame `old` to `new`; returns its new record."""
     if sha256(old) != record.sha256:
-        raise CaptureError(f"{old}: its checksum is not the journal's; run verify")
+        raise CaptureError(
+            f"{old}: its checksum differs from the journal's: run 'hairstage verify'"
+        )
     image, attributes = read_exr(old)
     with naming_full_disk(new, old.stat().st_size):
         write_exr(new, image, {k: attributes[k] for k in ATTRIBUTES if k in attributes})

@@ -1,4 +1,4 @@
-"""A picture of what an import has understood: cameras down, steps across."""
+"""A contact sheet of an import: cameras down, steps across."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.capture.exposures import Merged
-from reconstruction.capture.folder import Step
 from reconstruction.capture.import_folder import Import
+from reconstruction.capture.records import Step
 from reconstruction.files.durable import write_whole
 
 CELL, MOST_STEPS, MOST_CAMERAS = 160, 8, 24
@@ -19,10 +19,10 @@ RED, GREEN, BLUE = (40, 40, 230), (80, 200, 80), (230, 150, 60)
 
 
 def contact_sheet(understood: Import, out: Path) -> None:
-    """Write a PNG: a few steps of each kind in each camera, as bright as its single lights allow.
+    """Write a PNG with a few steps of each kind for each camera, at one exposure per camera.
 
-    Saturated pixels are red, hair is outlined in green, the subject in blue, what is missing
-    crossed. Raises `ImportProblem` for a picture that cannot be read.
+    Saturated pixels are red, hair is outlined in green, the subject in blue, missing frames are
+    crossed. Raises `ImportProblem` for an image that cannot be read.
     """
     steps = _chosen(understood.found.steps)
     cameras = list(understood.shot)[:MOST_CAMERAS]
@@ -31,7 +31,7 @@ def contact_sheet(understood: Import, out: Path) -> None:
         frames = {}
         for step in steps:
             if bracket := understood.found.frames.get((step.index, camera)):
-                frames[step] = understood.frame(bracket, camera)
+                frames[step] = understood.frames.frame(bracket, camera)
         lit = [f.radiance for s, f in frames.items() if s.kind == "olat"] or [
             f.radiance for f in frames.values()
         ]
@@ -45,7 +45,7 @@ def contact_sheet(understood: Import, out: Path) -> None:
 
 
 def _chosen(steps: tuple[Step, ...]) -> list[Step]:
-    """One or two of each kind, the rest single lights from first to last."""
+    """One of each other kind, the rest single lights from first to last."""
     others = [
         s for kind in ("dark", "all_on", "tracking", "scanline") for s in _of(steps, kind)[:1]
     ]
@@ -70,7 +70,7 @@ def _cell(
     outlines: tuple[NDArray[Any] | None, NDArray[Any] | None],
     name: str,
 ) -> NDArray[Any]:
-    """One picture, small, with its name."""
+    """One small image with its name."""
     if frame is None:
         out = np.full((CELL, CELL, 3), 30, np.uint8)
         cv2.line(out, (0, 0), (CELL, CELL), RED, 1)

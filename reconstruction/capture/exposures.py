@@ -1,4 +1,4 @@
-"""Pictures of one thing at several exposures, merged to one; and the light of empty stages."""
+"""Merging images at several exposures, and background pixels from clean plates."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from reconstruction.arrays import Bools, Floats
 from reconstruction.files.pictures import Picture
 
 FULL_WELL = 1e4
-"""Electrons that a full channel is taken to have: how noisy light is beside the step of a count."""
+"""Assumed electrons of a full channel: shot noise relative to the step of one count."""
 AGREES, SURE = 0.05, 4.0
-"""A pixel is as without the subject within this share, or so many steps of noise."""
+"""Relative difference, and standard deviations of noise, within which a pixel is unchanged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """`radiance (H, W, 3)`, and `saturated (H, W)` where even the shortest exposure is.
+    """`radiance (H, W, 3)`, and `saturated (H, W)` pixels of the shortest exposure.
 
-    `full` is the radiance from which on a channel saturates, `quantum` that of one count where it
-    is the same everywhere, else 0; `noise (H, W)` the standard deviation of the channels' mean.
+    `full` is the radiance at which a channel saturates, `quantum` that of one count if constant,
+    else 0; `noise (H, W)` is the standard deviation of the channels' mean.
     """
 
     radiance: Floats
@@ -32,7 +32,7 @@ class Merged:
     noise: Floats
 
     def marked(self) -> tuple[Floats, float]:
-        """The radiance `(H, W, 3)` with what is saturated, and only that, at `full` or above."""
+        """Radiance `(H, W, 3)` with exactly the saturated pixels at `full` or above, and `full`."""
         if not np.isfinite(self.full):
             return self.radiance, self.full
         brightest = self.radiance.max(axis=-1)
@@ -45,11 +45,11 @@ class Merged:
 
 
 def merge(pictures: Mapping[float, Picture], scale: float = 1.0) -> Merged:
-    """Merge pictures by seconds of exposure; `scale` is the radiance of a full channel at 1 s.
+    """Merge images by exposure in seconds; `scale` is the radiance of a full channel at 1 s.
 
-    The mean of what is not saturated, weighted by the inverse variance of a count's rounding and of
-    the photons of a sensor that holds `FULL_WELL` electrons. The photons are those that the longest
-    exposure that is not saturated gives: a weight that follows its own noise would bias the mean.
+    Unsaturated values are averaged with inverse-variance weights: rounding of a count, and shot
+    noise of a sensor with `FULL_WELL` electrons. Shot noise is estimated from the longest
+    unsaturated exposure, since weights from each value's own noise would bias the mean.
     """
     seconds = sorted(pictures)
     first = pictures[seconds[0]]
@@ -79,33 +79,32 @@ def merge(pictures: Mapping[float, Picture], scale: float = 1.0) -> Merged:
 
 
 def flattened(merged: Merged, flat: Floats) -> Merged:
-    """`merged` through a lens whose `flat (H, W, 3)` field has a mean of 1."""
+    """`merged` divided by a `flat (H, W, 3)` field of mean 1."""
     even = np.maximum(flat, np.float32(0.05))
     radiance = (merged.radiance / even).astype(np.float32)
     return replace(merged, radiance=radiance, noise=merged.noise / even.mean(axis=-1))
 
 
-class Unchanged:
-    """What of a camera's pictures is as it is without the subject, told light by light.
+class BackgroundPixels:
+    """Background pixels of one camera, from frames with and without the subject.
 
-    A pixel is the background where most of the lights that show anything there show the same with
-    and without the subject. A shadow on a wall changes it under a few lights, the subject, which
-    hides it, under nearly all.
+    A pixel is background if it is unchanged under most of the lights that reach it: a shadow
+    changes a wall under a few lights, the subject hides it under nearly all.
     """
 
     def __init__(self) -> None:
         self._same: Any = 0
-        self._told: Any = 0
+        self._lit: Any = 0
 
     def add(self, picture: Merged, plate: Merged) -> None:
         """One light with and without the subject."""
         a, b = picture.radiance.mean(axis=-1), plate.radiance.mean(axis=-1)
         noise = SURE * np.hypot(picture.noise, plate.noise)
         larger = np.maximum(np.abs(a), np.abs(b))
-        told = (larger > noise) & ~(picture.saturated & plate.saturated)
-        self._told = self._told + told
-        self._same = self._same + (told & (np.abs(a - b) <= np.maximum(noise, AGREES * larger)))
+        lit = (larger > noise) & ~(picture.saturated & plate.saturated)
+        self._lit = self._lit + lit
+        self._same = self._same + (lit & (np.abs(a - b) <= np.maximum(noise, AGREES * larger)))
 
     def subject(self) -> Bools:
         """The subject's pixels `(H, W)`, after one `add` or more."""
-        return np.asarray((self._told > 0) & (2 * self._same <= self._told))
+        return np.asarray((self._lit > 0) & (2 * self._same <= self._lit))

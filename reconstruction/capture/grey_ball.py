@@ -1,8 +1,7 @@
-"""W/(sr m²) from a matt grey ball in view: its light under one light is known, a picture's is not.
+"""Radiometric scale from a matt grey ball in view.
 
-A Lambertian ball of albedo ρ sends ρ/π · I cos θ/d² towards every camera from where a point light
-of intensity I stands at the distance d and under the angle θ to the normal. Nothing else is asked
-of the ball than where it lies, and that is seen.
+A Lambertian ball of albedo ρ has the radiance ρ/π · I cos θ/d² under a point light of intensity I
+at the distance d and the angle θ to the normal. Its position follows from its outlines.
 """
 
 from __future__ import annotations
@@ -21,16 +20,15 @@ from reconstruction.geometry.lights import Light
 from reconstruction.options import options
 
 POINTS = 600
-"""Points all over the ball."""
+"""Sample points on the ball."""
 FACING, LIT = 0.6, 0.3
-"""Cosines to the camera and to the light from which on a point is used: edges blur, and terminators
-are soft."""
+"""Least cosines to the camera and to the light of a sample: edges and terminators are blurred."""
 FEWEST = 20
-"""Points that a frame must show."""
+"""Samples required in a frame."""
 MEET = 0.5
-"""Of the ball's radius, how far rays through the circles' middles may pass each other."""
+"""Largest distance between rays through the outlines' centres, in units of the radius."""
 DISAGREE = 0.1
-"""Robust spread of frames about their median above which a user is told."""
+"""Robust spread of frames about their median that causes a note."""
 
 
 @options
@@ -47,18 +45,18 @@ class GreyBall:
 
 @dataclass(frozen=True, eq=False)
 class PlacedBall:
-    """A ball about `center (3,)`, of a `radius` in metres, seen by the cameras named in `seen`."""
+    """A ball at `center (3,)` with a `radius` in metres and outlines in the named `cameras`."""
 
     center: Array
     radius: float
     albedo: float
-    seen: tuple[str, ...]
+    cameras: tuple[str, ...]
 
     @classmethod
     def of(cls, ball: GreyBall, cameras: Mapping[str, Camera]) -> PlacedBall:
-        """Where the outlines say that it lies. Raises `ValueError` naming what does not fit."""
+        """Position and radius from the outlines. Raises `ValueError` naming what does not fit."""
         if unknown := sorted(set(ball.circles) - set(cameras)):
-            raise ValueError(f"circles: there is no camera {unknown[0]!r}")
+            raise ValueError(f"circles: no camera {unknown[0]!r}")
         if len(ball.circles) < 2:
             raise ValueError("circles: give the ball's outline in two cameras or more")
         names = tuple(ball.circles)
@@ -70,7 +68,7 @@ class PlacedBall:
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         total = across.sum(axis=0)
         if np.linalg.cond(total) > 1e6:
-            raise ValueError("circles: the cameras see the ball from one direction")
+            raise ValueError("circles: the cameras view the ball from one direction")
         center = np.linalg.solve(total, np.einsum("nij,nj->i", across, centers))
         rim = circles[:, None, 2:] * [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]
         rim = circles[:, None, :2] + rim
@@ -82,15 +80,15 @@ class PlacedBall:
         if off.max() > MEET * radius:
             worst = names[int(off.argmax())]
             raise ValueError(
-                f"circles: the one of {worst} passes the others' ball by {1e3 * off.max():.0f} mm, "
-                f"its radius is {1e3 * radius:.0f} mm: is it the same ball, are cameras right?"
+                f"circles: the ray of {worst} misses the ball by {1e3 * off.max():.0f} mm at a "
+                f"radius of {1e3 * radius:.0f} mm: check the outlines and the camera poses"
             )
         return cls(center, radius, ball.albedo, names)
 
     def factor(self, camera: Camera, light: Light, image: Floats, bad: Bools) -> Array | None:
-        """What `image (H, W, 3)` of one light is to be multiplied by, `(3,)`, for W/(sr m²).
+        """Factor `(3,)` from `image (H, W, 3)` under one light to W/(sr m²).
 
-        `bad (H, W)` are saturated pixels. None where too little of the ball is seen and lit.
+        `bad (H, W)` are saturated pixels. None if fewer than `FEWEST` samples are visible and lit.
         """
         normals = _directions(POINTS)
         points = self.center + self.radius * normals
@@ -109,13 +107,13 @@ class PlacedBall:
         found = np.array([map_coordinates(c, place, order=1) for c in image.transpose(2, 0, 1)])
         share = (cosine / squared)[used, None]
         sent = self.albedo / np.pi * light.intensity_towards(points[used]) * share
-        seen = found.mean(axis=1)
-        return None if not (seen > 0).all() else np.asarray(sent.mean(axis=0) / seen)
+        observed = found.mean(axis=1)
+        return None if not (observed > 0).all() else np.asarray(sent.mean(axis=0) / observed)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """W/(sr m²) of a picture's 1, with its standard error; `notes` for the user."""
+    """W/(sr m²) of an image value of 1, with its standard error; `notes` for the user."""
 
     value: float
     error: float
@@ -123,32 +121,30 @@ class Scale:
 
     @classmethod
     def of(cls, factors: Sequence[Array]) -> Scale:
-        """The median over frames of `PlacedBall.factor`. Raises `ValueError` without any."""
+        """The median of `PlacedBall.factor` over frames. Raises `ValueError` for none."""
         if not factors:
-            raise ValueError("no frame shows the lit side of the ball: are the circles on it?")
+            raise ValueError("no frame shows the lit side of the ball: check the circles")
         whole = np.array(factors)
-        # a frame whose light something stands before is far off, and to one side
+        # a frame whose light is occluded is a one-sided outlier
         logs = np.log(whole.mean(axis=1))
         middle = float(np.median(logs))
         spread = 1.4826 * float(np.median(np.abs(logs - middle)))
         channels = np.median(whole / whole.mean(axis=1, keepdims=True), axis=0)
         notes = []
         if spread > DISAGREE:
-            notes.append(
-                f"the grey ball: frames disagree by {spread:.0%}: is it in shadow, or shiny?"
-            )
+            notes.append(f"grey ball: frames disagree by {spread:.0%}: is it in shadow, or glossy?")
         if np.abs(channels - 1).max() > 0.05:
             notes.append(
-                "the grey ball looks coloured: red, green and blue would have to be multiplied by "
+                "grey ball: its images are coloured; multiply red, green and blue by "
                 + ", ".join(f"{c:.2f}" for c in channels)
-                + "; that is left to the camera's white balance"
+                + " (white balance of the camera)"
             )
         error = spread * np.sqrt(np.pi / 2 / len(logs))
         return cls(float(np.exp(middle)), float(error), tuple(notes))
 
 
 def _directions(count: int) -> Array:
-    """Unit vectors `(count, 3)`, spread evenly: the points of a Fibonacci lattice."""
+    """Unit vectors `(count, 3)` of a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     flat = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""Cameras and lights of a capture made elsewhere: read, brought into our world, and checked."""
+"""Cameras and lights of an imported capture: read, converted to the world frame, checked."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from reconstruction.options import options
 
 @dataclass(frozen=True)
 class Geometry:
-    """Cameras by the id that a file gives them, and lights, in our world; `notes` for the user."""
+    """Cameras by their id in the file, and lights, in the world frame; `notes` for the user."""
 
     cameras: Mapping[str | int, Camera]
     lights: list[Light] = field(default_factory=list)
@@ -37,9 +37,9 @@ class Geometry:
 
 @options
 class GeometryFiles:
-    """The files of cameras and lights that a user names, and what there is to know of them.
+    """The user's files of cameras and lights, and their placement.
 
-    `light_distance` in metres is where lights stand that are given as directions.
+    `light_distance` in metres applies to lights given as directions.
     """
 
     cameras: Path | None = None
@@ -52,41 +52,40 @@ CAMERA_FILES = ("sparse/0", "sparse", "transforms.json", "cameras.xml")
 LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
 
 
-def files_in(folder: Path, said: GeometryFiles) -> GeometryFiles:
-    """`said`, its paths in `folder`; unsaid, the first of `CAMERA_FILES` and `LIGHT_FILES` there.
+def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
+    """`given` with paths in `folder`, completed by the first of `CAMERA_FILES` and `LIGHT_FILES`.
 
-    Neither is looked for beside the folder's own cameras.json and lights.json. Raises
-    `PlacementError` where no file says where the cameras are, or the lights.
+    The folder's own cameras.json and lights.json take precedence over the latter. Raises
+    `PlacementError` if there is no file of cameras or lights.
     """
-    cameras, lights = (None if p is None else folder / p for p in (said.cameras, said.lights))
+    cameras, lights = (None if p is None else folder / p for p in (given.cameras, given.lights))
     if cameras is None and folder.is_dir() and not (folder / "cameras.json").is_file():
         cameras = next((p for n in CAMERA_FILES if (p := folder / n).exists()), None)
         if cameras is None:
             raise PlacementError(
-                f"{folder}: nothing says where the cameras are: give --cameras (COLMAP's folder, "
-                "transforms.json, Metashape's or OpenCV's file), or put cameras.json there"
+                f"{folder}: no file of cameras: give --cameras (a COLMAP folder, transforms.json, "
+                "a Metashape or OpenCV file) or add cameras.json"
             )
     if cameras is not None and lights is None and not (folder / "lights.json").is_file():
         lights = next((p for n in LIGHT_FILES if (p := folder / n).exists()), None)
         if lights is None:
             raise PlacementError(
-                f"{folder}: nothing says where the lights are: give --lights (.csv, .json, .npy or "
-                ".obj of their positions or directions), or put lights.json there"
+                f"{folder}: no file of lights: give --lights (.csv, .json, .npy or .obj of their "
+                "positions or directions) or add lights.json"
             )
-    return replace(said, cameras=cameras, lights=lights)
+    return replace(given, cameras=cameras, lights=lights)
 
 
 def read_geometry(files: GeometryFiles) -> Geometry:
-    """Read, place and check; nothing where neither is named.
+    """Read, place and check; empty without files.
 
-    Raises `ValueError` that says what is wrong and which option or file would mend it.
+    Raises `ValueError` naming the file and the option that would correct it.
     """
     cameras: list[Camera] = []
     notes: list[str] = []
     if files.cameras is None and files.lights is not None:
         raise PlacementError(
-            "--lights goes with --cameras, which they are held against; beside cameras.json lights "
-            "are in the folder's lights.json"
+            "--lights requires --cameras; with cameras.json the lights are read from lights.json"
         )
     if files.cameras is not None:
         read = read_cameras(files.cameras)
@@ -95,7 +94,7 @@ def read_geometry(files: GeometryFiles) -> Geometry:
         if read.unitless:
             unit = files.placement.unit
             length = unit if isinstance(unit, str) else f"{unit:g} m"
-            notes.append(f"{files.cameras} has no unit of its own: taken as {length} (--unit)")
+            notes.append(f"{files.cameras} has no unit: {length} is assumed (--unit)")
         try:
             notes += check_cameras(cameras, files.placement, read.axes)
         except PlacementError as error:
@@ -116,13 +115,13 @@ def _lights(
     for light in lights:
         if light.beside is not None and light.beside not in names:
             raise PlacementError(
-                f"{files.lights}: {light.name}: colocated_camera: there is no camera "
+                f"{files.lights}: {light.name}: colocated_camera: no camera "
                 f"{light.beside!r}; there are {', '.join(names)}"
             )
     if files.light_distance is not None:
         if not directions:
             raise PlacementError(
-                f"{files.lights}: --light-distance is for directions, of length 1; these are places"
+                f"{files.lights}: --light-distance applies to directions (length 1), not positions"
             )
         turned = placed_lights(lights, PlacementOptions(up=where.up))
         center = Sight.of(cameras).point
@@ -135,6 +134,6 @@ def _lights(
     if not directions:
         return out, []
     return out, [
-        f"{files.lights}: all lights are 1 from the origin: taken for places; where they are "
-        "directions, give --light-distance"
+        f"{files.lights}: all lights are at distance 1 from the origin and are read as positions; "
+        "if they are directions, give --light-distance"
     ]

@@ -1,7 +1,6 @@
-"""The origin of an imported world, moved to the subject: all after the import takes it to be there.
+"""The origin of an imported capture, moved to the subject, where all later steps expect it.
 
-COLMAP's origin is anywhere, a stage's often on the floor. Baselines, environments, warnings and the
-first directions of strands go by where lights stand from the origin.
+COLMAP's origin is arbitrary, a stage's often on the floor.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from reconstruction.geometry.placement import FURTHEST, NEAREST, PlacementError,
 from reconstruction.geometry.rig import Rig
 
 NEAR = 0.1
-"""Metres: a subject that is this near to the origin stays where it is."""
+"""Metres: distance of the subject from the origin up to which nothing is moved."""
 SPREAD = 0.03
-"""The least `Sight.diversity`, axes 14° from their mean, that tells how far away the subject is."""
+"""Least `Sight.diversity` (axes 14° from their mean) that determines the subject's distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """`point (3,)` of the user's world, in metres with z up, is the origin of the capture's.
+    """The capture's origin as a `point (3,)` of the user's frame, metres with z up; 0 if unmoved.
 
-    It is 0 where nothing is moved; `notes` for the user.
+    `notes` are for the user.
     """
 
     point: Array = field(default_factory=lambda: np.zeros(3))
@@ -35,34 +34,36 @@ class Origin:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> Origin:
-        """What the cameras look at, in whole millimetres, where it is not about the origin."""
+        """The point that the cameras look at, in whole millimetres, if it is not at the origin."""
         try:
             sight = Sight.of(cameras)
         except PlacementError:
-            alone = "there is but one" if len(cameras) == 1 else "they all look the same way"
+            alone = "there is only one" if len(cameras) == 1 else "their axes are parallel"
             return cls(notes=(_unknown(alone),))
         point = np.round(sight.point, 3) + 0.0  # no -0
         if np.linalg.norm(point) <= NEAR:
             return cls()
         distance = float(np.median(sight.distance))
         if not sight.whole:
-            return cls(notes=(_unknown("they do not look at one place"),))
+            return cls(notes=(_unknown("they do not look at one point"),))
         if not NEAREST <= distance <= FURTHEST:
-            return cls(notes=(_unknown(f"they stand {distance:.3g} m from what they look at"),))
+            return cls(
+                notes=(_unknown(f"they are {distance:.3g} m from the point that they look at"),)
+            )
         if sight.diversity < SPREAD:
-            return cls(notes=(_unknown("they look nearly the same way"),))
-        return cls(point, (_told(point),))
+            return cls(notes=(_unknown("their axes are nearly parallel"),))
+        return cls(point, (_moved(point),))
 
     @property
     def moved(self) -> bool:
-        """Whether it is another one than the user's."""
+        """Whether it differs from the user's."""
         return bool(self.point.any())
 
     def rig(self, rig: Rig) -> Rig:
-        """`rig` about the new origin."""
+        """`rig` relative to the new origin."""
         if not self.moved:
             return rig
-        still, back = np.eye(3), self.point  # devices that see what they saw before
+        still, back = np.eye(3), self.point
         return replace(
             rig,
             cameras=tuple(c.moved(still, back) for c in rig.cameras),
@@ -71,13 +72,13 @@ class Origin:
         )
 
     def head(self, head: Mesh | None) -> Mesh | None:
-        """`head` about the new origin."""
+        """`head` relative to the new origin."""
         if head is None or not self.moved:
             return head
         return head.transformed(np.eye(3), -self.point)
 
     def obj(self, text: str) -> str:
-        """The text of an OBJ about the new origin."""
+        """The text of an OBJ relative to the new origin."""
         if not self.moved:
             return text
         return "".join(self._line(line) for line in text.splitlines(keepends=True))
@@ -90,19 +91,18 @@ class Origin:
         return " ".join(["v", *(f"{x:.9g}" for x in place), *words[4:]]) + "\n"
 
 
-def _told(point: Array) -> str:
+def _moved(point: Array) -> str:
     return (
-        f"the cameras look at {_text(point)} m of their world, not at its origin, about which a "
-        f"capture's subject is: cameras, lights, projectors, head.obj and scalp.obj were moved by "
-        f"{_text(-point)} m. Add {_text(point)} m to results to have them in your world, in metres "
-        "with z up; take it off what you give later"
+        f"the cameras look at {_text(point)} m; cameras, lights, projectors, head.obj and "
+        f"scalp.obj were moved by {_text(-point)} m, so that the subject is at the origin. To "
+        f"return to your frame (metres, z up), add {_text(point)} m to the results"
     )
 
 
 def _unknown(why: str) -> str:
     return (
-        f"where the subject is cannot be told from the cameras, as {why}: it is taken to be about "
-        "the origin of their world; if it is not, move cameras, lights and head there"
+        f"the cameras do not determine the subject's position, as {why}: it is assumed at the "
+        "origin; if it is elsewhere, move cameras, lights and head"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a user says of a folder of pictures (`import.toml`), and which file is which frame."""
+"""`import.toml`, and matching of files with frames by their names."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from reconstruction.capture.folder import CaptureError, Step, StepKind
 from reconstruction.capture.grey_ball import GreyBall
 from reconstruction.capture.import_geometry import GeometryFiles
+from reconstruction.capture.records import CaptureError, Step, StepKind
 from reconstruction.files.pictures import (
     FORMATS,
     LOSSY,
@@ -35,13 +35,13 @@ class ImportProblem(CaptureError):
 
 @options
 class Patterns:
-    """Where each kind of picture lies, relative to the folder.
+    """File name patterns of each kind of image, relative to the folder.
 
-    `{camera}`, `{light}` and `{projector}` are names, or the number that a name ends in;
-    `{exposure}` is seconds (`0.02`, `1-50`) or a name of `exposures`; `{row}` a projector's row;
-    `{number}` counts what else there is several of, in the order of shooting: tracking frames and
-    rows in one count; of lights that are shot once cameras may count apart; `*` is any text.
-    `clean_plate` shows the stage without the subject, `flat` an evenly lit field.
+    `{camera}`, `{light}` and `{projector}` are names, or the number at the end of a name;
+    `{exposure}` is seconds (`0.02`, `1-50`) or a key of `exposures`; `{row}` a projector's row;
+    `{number}` the order of capture, one count for tracking frames and rows (lights captured once
+    may be counted per camera); `*` is any text. `clean_plate` shows the stage without the subject,
+    `flat` an evenly lit field.
     """
 
     olat: str = "images/{camera}/{light}.*"
@@ -59,12 +59,11 @@ class Patterns:
 class ImportSettings:
     """`import.toml`, field by field.
 
-    `exposure` in seconds is that of pictures whose pattern has no `{exposure}`, "file" what each
-    says itself (EXIF); `exposures` names others. `first_light`: the number in a picture's name that
-    stands for the first light of the list, those after it following; None: the number that the
-    light's own name ends in. `units`: whether a full channel at 1 s is `scale` W/(sr m²), or
-    unknown; a `grey_ball` in view says it instead of `scale`. `geometry`: the files of cameras and
-    lights, relative to the folder.
+    `exposure` in seconds applies to patterns without `{exposure}`; "file" reads it from EXIF;
+    `exposures` are named exposures. `first_light` is the number in a file name of the first light
+    in the list; None: numbers are those at the end of the lights' names. `units` is whether a full
+    channel at 1 s is `scale` W/(sr m²) or unknown; a `grey_ball` determines it instead of `scale`.
+    `geometry` are the files of cameras and lights, relative to the folder.
     """
 
     pictures: Patterns = Patterns()
@@ -91,15 +90,15 @@ def read_settings(path: Path) -> ImportSettings:
 
 
 Bracket = dict[float, Path]
-"""One picture at several exposures: files by seconds."""
+"""Files of one frame by exposure in seconds."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a folder's names say: `frames` by step and camera, and what goes with them by camera.
+    """Matched files: `frames` by step and camera; flats and masks by camera.
 
-    `plates` are by light (None: under all of them) and camera. `unmatched` are pictures that no
-    pattern names, relative to the folder.
+    `plates` are clean plates by light (None: all lights) and camera. `unmatched` are images without
+    a pattern, relative to the folder.
     """
 
     steps: tuple[Step, ...]
@@ -114,7 +113,7 @@ class Found:
 
 @dataclass(frozen=True)
 class _Match:
-    """A file, and what its name says."""
+    """A file and the fields of its name."""
 
     path: Path
     camera: str
@@ -126,16 +125,16 @@ class _Match:
 
     @property
     def shot(self) -> tuple[Any, ...]:
-        """What is the same in all cameras and exposures of one step; sorts by time."""
+        """Identifies a step over cameras and exposures; sorts by time."""
         order = -1 if self.number is None else self.number
         return order, self.projector or "", -1 if self.row is None else self.row
 
 
 def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
-    """Match the names of all files in `folder` with the patterns, and these with `rig`.
+    """Match all files in `folder` with the patterns and the names in `rig`.
 
-    Raises `ImportProblem`: a pattern that cannot be used, no picture of a single light, two files
-    for one frame, rows that cannot be placed between tracking frames.
+    Raises `ImportProblem` for an invalid pattern, no single-light image, two files for one frame,
+    or rows without an order among tracking frames.
     """
     names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
     patterns, reader = settings.pictures, _Names(rig, settings)
@@ -153,7 +152,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     for kind in get_args(StepKind):
         groups: dict[tuple[Any, ...], list[_Match]] = defaultdict(list)
         for match in matches.get(kind, []):
-            if kind == "olat":  # of a light that is shot once cameras may have numbers of their own
+            if kind == "olat":  # lights captured once may be numbered per camera
                 place = reader.lights.index(str(match.light))
                 groups[(place,) if once else (place, *match.shot)].append(match)
             else:
@@ -181,7 +180,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     left = [n for n, p in names.items() if p not in used and p.suffix.lower() in FORMATS]
     shot = {s.light for s in steps}
     without = sorted({c.name for c in rig.cameras} - {camera for _, camera in frames})
-    bare = [f"no picture of {_few(without)}: all its frames are missing"] if without else []
+    bare = [f"{_few(without)}: no images, all frames are missing"] if without else []
     return Found(
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
         tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
@@ -189,49 +188,47 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
 
 
 def _files(folder: Path) -> list[Path]:
-    """All files below `folder`, in order; folders that are links are looked into, each once, after
-    those that are not."""
+    """All files below `folder`, sorted; linked folders are visited once, after the others."""
     found: list[Path] = []
-    seen: set[str] = set()
+    visited: set[str] = set()
     roots = [folder]
-    for root in roots:  # which links are added to
+    for root in roots:  # links are appended below
         for at, below, names in os.walk(root):
             real = os.path.realpath(at)
-            if real in seen:
+            if real in visited:
                 below.clear()
                 continue
-            seen.add(real)
+            visited.add(real)
             roots += [link for n in sorted(below) if (link := Path(at, n)).is_symlink()]
             found += [Path(at, n) for n in names]
     return sorted(p for p in found if p.is_file())
 
 
 def _check_order(patterns: Patterns, matches: Mapping[str, Sequence[_Match]]) -> None:
-    """Raises `ImportProblem` where rows have no place among several tracking frames.
+    """Raise `ImportProblem` for rows without an order among several tracking frames.
 
-    They would all come before the first one, whose pose is the reference: no motion would be taken
-    off them, though one is solved and reported.
+    They would all precede the first one, whose pose is the reference, and the solved motion would
+    not be applied to them.
     """
     several = len({m.shot for m in matches.get("tracking", [])}) > 1
     rows = patterns.scanline if matches.get("scanline") else None
     if several and rows is not None and "{number}" not in rows:
         raise ImportProblem(
-            f"pictures.scanline = {rows!r}: without {{number}} nothing says between which tracking "
-            f"frames ({patterns.tracking!r}) a row was shot, and the subject's motion could not be "
-            "taken off: give rows the {number} of the same count, or, where the subject kept "
-            "still, leave `tracking` out"
+            f"pictures.scanline = {rows!r}: without {{number}} the order of rows and tracking "
+            f"frames ({patterns.tracking!r}) is unknown, and motion cannot be compensated: number "
+            "rows and tracking frames in one count, or remove `tracking` for a static subject"
         )
 
 
 def _brackets(matches: Sequence[_Match]) -> dict[str, Bracket]:
-    """Files by camera and exposure. Raises `ImportProblem` where two say the same."""
+    """Files by camera and exposure. Raises `ImportProblem` for two files of the same."""
     out: dict[str, Bracket] = {}
     for match in matches:
         bracket = out.setdefault(match.camera, {})
         if other := bracket.get(match.exposure):
             raise ImportProblem(
-                f"{match.path} and {other} are both one frame of {match.camera}: remove one, or "
-                f"give a pattern that tells them apart ({{exposure}}, {{number}}, .png for .*)"
+                f"{match.path} and {other} match the same frame of {match.camera}: remove one, or "
+                f"use a pattern that separates them ({{exposure}}, {{number}}, .png for .*)"
             )
         bracket[match.exposure] = match.path
     return out
@@ -240,22 +237,22 @@ def _brackets(matches: Sequence[_Match]) -> dict[str, Bracket]:
 def _notes(
     rig: Rig, lights: set[str | None], used: set[Path], settings: ImportSettings, left: list[str]
 ) -> list[str]:
-    """What the user should know before a pixel is read."""
+    """Notes for the user before a pixel is read."""
     out = []
     if absent := [x.name for x in rig.lights if x.name not in lights]:
-        out.append(f"{len(absent)} lights have no picture and are left out: {_few(absent)}")
+        out.append(f"{len(absent)} lights have no image and are skipped: {_few(absent)}")
     suffixes = {p.suffix.lower() for p in used}
     if suffixes & LOSSY:
         out.append(
-            "JPEG: its blocks hide fine hair, and what its camera did to contrast and colour "
-            "cannot be told: do not trust figures of colour and roughness; give RAW instead"
+            "JPEG: compression hides fine hair, and the camera's tone curve is unknown: colour and "
+            "roughness are unreliable; use RAW"
         )
     if left:
-        out.append(f"{len(left)} pictures match no pattern: {_few(left)}")
+        out.append(f"{len(left)} images match no pattern: {_few(left)}")
     if settings.units is None and settings.grey_ball is None and suffixes - {".exr"}:
         out.append(
-            "relative units: no `scale` says what a full channel is in W/(sr m²): how dark the "
-            "hair is, against its light, is not known until a grey ball in view says it"
+            "relative units: hair albedo is relative until you provide `scale` or a grey ball "
+            "(docs/how-to/import.md)"
         )
     return out
 
@@ -265,7 +262,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 class _Names:
-    """How the names of a rig are written in the names of files."""
+    """The names of a rig in file names."""
 
     def __init__(self, rig: Rig, settings: ImportSettings) -> None:
         self.cameras = [c.name for c in rig.cameras]
@@ -275,16 +272,18 @@ class _Names:
         self.sensitivities: set[str] = set()
 
     def matching(self, role: str, pattern: str, names: Mapping[str, Path]) -> list[_Match]:
-        """Files whose names follow `pattern`. Raises `ImportProblem` where it says too little."""
+        """Files matching `pattern`. Raises `ImportProblem` if a required field is missing."""
         needed = {"olat": {"camera", "light"}, "scanline": {"camera", "projector", "row"}}
         given = {"camera": self.cameras, "projector": self.projectors}
         fields = set(re.findall(r"{(.*?)}", pattern))
         where = f"pictures.{role} = {pattern!r}"
         if unknown := fields - set(FIELDS):
-            raise ImportProblem(f"{where}: no fields {sorted(unknown)}; there are {list(FIELDS)}")
+            raise ImportProblem(
+                f"{where}: unknown fields {sorted(unknown)}; expected some of {list(FIELDS)}"
+            )
         alone = {f for f, names in given.items() if len(names) == 1}
         if missing := needed.get(role, {"camera"}) - fields - alone:
-            raise ImportProblem(f"{where}: must say which {' and '.join(sorted(missing))}")
+            raise ImportProblem(f"{where}: the fields {' and '.join(sorted(missing))} are required")
         expression = re.compile(self._expression(pattern))
         found = ((path, expression.fullmatch(name)) for name, path in names.items())
         timed = role not in ("flat", "hair", "subject")
@@ -303,35 +302,37 @@ class _Names:
             "row": number,
             "number": number,
         }
-        out, seen = "", set()
+        out, used = "", set()
         for part in re.split(r"({.*?}|\*)", pattern):
             if part == "*":
                 out += "[^/]*"
             elif part.startswith("{"):
                 name = part[1:-1]
-                out += f"(?P={name})" if name in seen else f"(?P<{name}>{kinds[name]})"
-                seen.add(name)
+                out += f"(?P={name})" if name in used else f"(?P<{name}>{kinds[name]})"
+                used.add(name)
             else:
                 out += re.escape(part)
         return out
 
-    def _read(self, path: Path, said: Mapping[str, str], timed: bool) -> _Match | None:
-        """None where a number stands for nothing that the rig has; `timed`: seconds matter."""
+    def _read(self, path: Path, fields: Mapping[str, str], timed: bool) -> _Match | None:
+        """None for a number that the rig does not have; `timed`: the exposure is needed."""
         camera = (
-            self._name(said.get("camera"), self.cameras) if "camera" in said else self.cameras[0]
+            self._name(fields.get("camera"), self.cameras)
+            if "camera" in fields
+            else self.cameras[0]
         )
-        light = self._light(said["light"]) if "light" in said else None
-        projector = self._name(said.get("projector"), self.projectors)
-        if "row" in said and "projector" not in said:
+        light = self._light(fields["light"]) if "light" in fields else None
+        projector = self._name(fields.get("projector"), self.projectors)
+        if "row" in fields and "projector" not in fields:
             projector = self.projectors[0]
-        if camera is None or (light is None and "light" in said):
+        if camera is None or (light is None and "light" in fields):
             return None
-        if projector is None and "projector" in said:
+        if projector is None and "projector" in fields:
             return None
-        row, number = (int(said[f]) if f in said else None for f in ("row", "number"))
+        row, number = (int(fields[f]) if f in fields else None for f in ("row", "number"))
         exposure = self._settings.exposure
-        if "exposure" in said:
-            exposure = self._seconds(said["exposure"])
+        if "exposure" in fields:
+            exposure = self._seconds(fields["exposure"])
         elif exposure == "file":
             exposure = self._seconds_in(path) if timed else 1.0
         return _Match(path, camera, light, projector, row, number, exposure)
@@ -375,24 +376,24 @@ class _Names:
         return seconds
 
     def notes(self) -> list[str]:
-        """What differs between the shots, and is not accounted for."""
+        """Differences between exposures that are not corrected."""
         if len(self.sensitivities) < 2:
             return []
         several = _few(sorted(self.sensitivities))
-        return [f"pictures differ in more than seconds ({several}): only seconds are accounted for"]
+        return [f"images differ in ISO or aperture ({several}): only exposure times are corrected"]
 
     def why_none(self, folder: Path, pattern: str, names: Mapping[str, Path]) -> str:
-        """Why no file is a picture of one light."""
+        """Why no file is a single-light image."""
         pictures = [n for n, p in names.items() if p.suffix.lower() in FORMATS]
         if not pictures:
-            return f"{folder}: has no pictures ({' '.join(sorted(FORMATS))})"
+            return f"{folder}: no images ({' '.join(sorted(FORMATS))})"
         return (
-            f"{folder}: no file is called {pattern!r} with a camera of {_few(self.cameras)} and a "
-            f"light of {_few(self.lights)}; there is {_few(pictures)}: give --pictures a pattern"
+            f"{folder}: no file matches {pattern!r} with a camera of {_few(self.cameras)} and a "
+            f"light of {_few(self.lights)}; found {_few(pictures)}: give --pictures a pattern"
         )
 
 
 def _any_of(choices: Sequence[str], plain: int) -> str:
-    """An expression for one of `choices`, of which the last `plain` are expressions themselves."""
+    """A regular expression for one of `choices`; the last `plain` are expressions themselves."""
     names = sorted(choices[:-plain], key=len, reverse=True)
     return "|".join([*map(re.escape, names), *choices[-plain:]])

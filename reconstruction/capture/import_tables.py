@@ -20,7 +20,7 @@ from reconstruction.geometry.rig import Rig, RigError
 from reconstruction.reading import read_json
 
 SMALLEST, LARGEST = 0.03, 2.5
-"""Metres across a part of a scalp, and a head on its body."""
+"""Metres: extent of a part of a scalp, and of a head with its body."""
 
 
 def _entries(path: Path, key: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -68,7 +68,7 @@ def _count(entry: dict[str, Any], field: str, where: str) -> int:
 
 
 def _id(entry: dict[str, Any], prefix: str, where: str) -> tuple[str | int, str]:
-    """An entry's id and the name it stands for."""
+    """An entry's id and name."""
     value = _take(entry, "id", where)
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return value, f"{prefix}_{value:02d}"
@@ -84,7 +84,7 @@ def cameras_of(path: Path) -> dict[str | int, Camera]:
         where = f"{path}: cameras[{i}]"
         id_, name = _id(entry, "cam", where)
         if name in [c.name for c in out.values()]:
-            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
+            raise ImportProblem(f"{where}.id: duplicate {id_!r}")
         width, height = _count(entry, "width", where), _count(entry, "height", where)
         K, R = (_numbers(entry, f, (3, 3), where) for f in ("K", "R"))
         t = _numbers(entry, "t", (3,), where)
@@ -104,7 +104,7 @@ def cameras_of(path: Path) -> dict[str | int, Camera]:
 
 
 def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
-    """Lights; `cameras` are names by id, for those that a light is beside."""
+    """Lights; `cameras` are names by id, for `colocated_camera`."""
     entries, data = _entries(path, "lights")
     for field, unit in (("position", "m"), ("intensity", "W/sr")):
         units = data.get("units", {})
@@ -116,7 +116,7 @@ def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
         where = f"{path}: lights[{i}]"
         id_, name = _id(entry, "light", where)
         if name in [light.name for light in out]:
-            raise ImportProblem(f"{where}.id: {id_!r} is there twice")
+            raise ImportProblem(f"{where}.id: duplicate {id_!r}")
         position, intensity = (_numbers(entry, f, (3,), where) for f in ("position", "intensity"))
         if (intensity < 0).any():
             raise ImportProblem(f"{where}.intensity: must not be negative, got {intensity}")
@@ -131,7 +131,7 @@ def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
 
 
 def projectors_of(path: Path) -> tuple[Projector, ...]:
-    """Those of a rig's table of projectors; none where there is no file."""
+    """Projectors, none without the file."""
     if not path.is_file():
         return ()
     entries = _entries(path, "projectors")[0]
@@ -145,9 +145,9 @@ def projectors_of(path: Path) -> tuple[Projector, ...]:
 
 
 def check_metres(folder: Path, rig: Rig, *own: str) -> None:
-    """Whether the folder's `own` files ("cameras", "lights") can count in metres.
+    """Raise `ImportProblem` if the folder's `own` files ("cameras", "lights") are not in metres.
 
-    Raises `ImportProblem` where most are too far from what the cameras look at, or too near.
+    That is, if the median distance from the point that the cameras look at is implausible.
     """
     try:
         sight = Sight.of(rig.cameras)
@@ -159,24 +159,23 @@ def check_metres(folder: Path, rig: Rig, *own: str) -> None:
         distance = float(np.median(far[kind]))
         if sight.whole and not NEAREST <= distance <= FURTHEST:
             raise ImportProblem(
-                f"{folder / kind}.json: the {kind} stand {length(distance)} from what the "
-                "cameras look at: its numbers must be metres, with z up, whatever the unit of "
-                "other files"
+                f"{folder / kind}.json: the {kind} are {length(distance)} from the point that the "
+                f"cameras look at, expected {NEAREST} to {FURTHEST} m: give metres with z up"
             )
 
 
 def _check_size(path: Path, points: Array) -> None:
-    """Whether `points (N, 3)` of a head, or of a part of one, can be metres."""
+    """Raise `ImportProblem` if `points (N, 3)` of a head or a part of one are not in metres."""
     wide = float(np.ptp(points, axis=0).max())
     if not SMALLEST <= wide <= LARGEST:
         raise ImportProblem(
-            f"{path}: is {length(wide)} wide: its numbers must be metres, with z up, whatever the "
-            "unit of cameras and lights"
+            f"{path}: is {length(wide)} wide, expected {SMALLEST} to {LARGEST} m: give metres with "
+            "z up"
         )
 
 
 def head_of(path: Path) -> Mesh | None:
-    """The mesh of head.obj; None where there is no file."""
+    """The mesh of head.obj, None without the file."""
     if not path.is_file():
         return None
     try:
@@ -188,7 +187,7 @@ def head_of(path: Path) -> Mesh | None:
 
 
 def scalp_of(path: Path) -> str | None:
-    """The text of a file of points, once it could be read as such."""
+    """The text of a readable file of points, None without the file."""
     if not path.is_file():
         return None
     try:

@@ -1,8 +1,4 @@
-"""How strong the lights are of pictures in relative units: as hair and skin make likely, a guess.
-
-Where nothing says what a picture's numbers are in W/(sr m²), any strength of the lights is as true
-as another; but what is fitted to the pictures takes hair to reflect some of its light and no more.
-"""
+"""A guess of the lights' intensity for images in relative units, from a head's reflectance."""
 
 from __future__ import annotations
 
@@ -14,17 +10,17 @@ from reconstruction.arrays import Floats
 from reconstruction.geometry.lights import Light
 
 LIKELY = 0.2
-"""Of its light that a head is taken to reflect, as measured here: brown hair and fair skin 0.18."""
-_BRIGHTEST = 98.0  # percentile of what is not dark from which on a pixel is a highlight, or noise
+"""Assumed reflectance of a head; measured for brown hair and fair skin: 0.18."""
+_BRIGHTEST = 98.0  # percentile of lit pixels at which highlights and noise are clipped
 
 
 def likely_strength(shown: Iterable[tuple[Light, Floats]]) -> float:
-    """What the lights' intensities are to be multiplied by; 1 where all pictures are dark.
+    """Factor on the lights' intensities; 1 if all images are dark.
 
-    `shown` are lights and what pictures `(H, W, 3)` show under each alone, in any unit. What a
-    picture reflects is its radiance over that of a white matte surface at the origin that faces the
-    light, averaged with itself as weight: a dark background, however large, has no say. Of the
-    pictures the median counts, so that neither lights behind the head decide nor those before it.
+    `shown` are lights and images `(H, W, 3)` under each alone, in any unit. The reflectance of an
+    image is its radiance over that of a white matte surface at the origin facing the light,
+    averaged with itself as weight, so that a dark background does not count. The median over images
+    is used, since lights behind and in front of the head differ.
     """
     found = []
     for light, image in shown:

@@ -1,8 +1,7 @@
-"""Takes of single lights with fully lit frames between them: which file is which light's.
+"""The light of each file in a take of single lights with fully lit frames for tracking.
 
-All lights come on after 19 single ones, and from then on after every 20, so that the subject can be
-tracked: frames 0, 20, 41, 62, … of the pattern (FaceOLAT, issues 4, 7 and 8). Files of some takes
-begin a frame or more before it.
+All lights are on after the first 19 single lights and then after every 20: frames 0, 20, 41, 62, …
+of the pattern (FaceOLAT, issues 4, 7 and 8). Some takes have files before the pattern.
 """
 
 from __future__ import annotations
@@ -14,18 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import Bools
-from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.records import CaptureError
 
 FIRST_CYCLE, CYCLE = 20, 21
-"""Frames until the stage is fully lit again: at first, and from then on."""
+"""Frames between fully lit ones: at the start, and later."""
 
 
 class PresetProblem(CaptureError):
-    """A folder that is not of the preset's layout; the message says what was expected where."""
+    """A folder without the preset's layout; the message names the file and what was expected."""
 
 
 def fully_lit(count: int) -> list[int]:
-    """Frames of a take of `count` single lights in which the whole stage is lit: 0, 20, 41, …"""
+    """Fully lit frames in a take of `count` single lights: 0, 20, 41, …"""
     out, singles, at = [0], 0, 0
     while singles < count:
         run = min((FIRST_CYCLE if at == 0 else CYCLE) - 1, count - singles)
@@ -36,10 +35,8 @@ def fully_lit(count: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Where in a take's files the pattern begins, `start`; which are `lit` fully, and which not.
-
-    `lit (N,)` is by brightness; `wrong` are files that the pattern has otherwise.
-    """
+    """First file `start` of the pattern; fully `lit (N,)` files by brightness; and `wrong` files,
+    whose brightness contradicts the pattern."""
 
     start: int
     lit: Bools
@@ -47,16 +44,16 @@ class Pattern:
 
 
 def find_pattern(brightness: ArrayLike, order: Sequence[int]) -> Pattern:
-    """Lay the pattern over a take by the `brightness (N,)` of its files in one camera.
+    """Align the pattern with the `brightness (N,)` of a take's files in one camera.
 
-    `order` is the light of each frame of the pattern, -1 for the fully lit ones. Raises
-    `PresetProblem` where they cannot be told from single lights, or stand elsewhere.
+    `order` is the light of each frame of the pattern, -1 if fully lit. Raises `PresetProblem` if
+    fully lit frames cannot be identified or contradict the pattern.
     """
     value = np.log(np.maximum(np.asarray(brightness, float), 1e-12))
     whole = np.flatnonzero(np.asarray(order) < 0)
     latest = len(value) - len(order)
     if latest < 0:
-        raise PresetProblem(f"{len(value)} frames, the pattern of lights has {len(order)}")
+        raise PresetProblem(f"{len(value)} frames, expected {len(order)} or more")
 
     def contrast(start: int) -> float:
         inside = value[start : start + len(order)]
@@ -68,8 +65,8 @@ def find_pattern(brightness: ArrayLike, order: Sequence[int]) -> Pattern:
     middle = (np.median(inside[whole]) + np.quantile(single, 0.75)) / 2
     if np.median(inside[whole]) - np.quantile(single, 0.75) < np.log(1.5):
         raise PresetProblem(
-            "frames with all lights on cannot be told from single lights by brightness: are the "
-            "frames of one take, in order, and none missing?"
+            "fully lit frames are not brighter than single lights: check that the frames are of "
+            "one take, in order and complete"
         )
     lit = value > middle
     wrong = [
@@ -78,14 +75,14 @@ def find_pattern(brightness: ArrayLike, order: Sequence[int]) -> Pattern:
     if len(wrong) > max(2, 0.1 * len(order)):
         places = ", ".join(map(str, np.flatnonzero(lit)[:20]))
         raise PresetProblem(
-            f"all lights are on in the frames {places}…: that is not the pattern 0, 20, 41, … from "
-            "any frame on; the single lights cannot be named"
+            f"the frames {places}… are fully lit, expected 0, 20, 41, … from some frame on: the "
+            "single lights cannot be identified"
         )
     return Pattern(start, np.asarray(lit), wrong)
 
 
 def with_fully_lit(singles: Sequence[int]) -> list[int]:
-    """The light of each frame, -1 where all are lit."""
+    """The light of each frame, -1 if fully lit."""
     out, rest = [], iter(singles)
     lit = set(fully_lit(len(singles)))
     for i in range(len(singles) + len(lit)):

@@ -1,4 +1,4 @@
-"""Layouts of public OLAT sets: which file is which frame, and where cameras and lights stand.
+"""Layouts of public OLAT sets: frames, cameras and lights.
 
 FaceOLAT (github.com/prraoo/FaceOLAT) and HumanOLAT (github.com/TMT22/HumanOLAT), as their pages and
 tools describe them; tested on imitations only. All lights are on between single lights, so that
@@ -17,10 +17,10 @@ from typing import Any, Literal
 import numpy as np
 
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Step, StepKind
 from reconstruction.capture.import_geometry import Geometry
 from reconstruction.capture.import_settings import Found, ImportSettings
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with_fully_lit
+from reconstruction.capture.records import Step, StepKind
 from reconstruction.containment import plain_file
 from reconstruction.files.cameras import CameraFile, read_cameras
 from reconstruction.files.lights import LightFile, read_lights
@@ -40,12 +40,12 @@ HATCH = (
     *(178, 179, 208, 209, 210, 237, 238, 239, 240, 267, 268, 269, 270, 271),
     *(295, 296, 297, 298, 319, 320, 321),
 )
-"""Lights on the door of HumanOLAT's stage, from 0: its authors advise against their positions."""
+"""Lights on the door of HumanOLAT's stage, from 0: their positions are inaccurate."""
 
 
 @dataclass(frozen=True)
 class TakeFrame:
-    """One file: of which kind of step, `light` (single lights only), and `number` in the take."""
+    """One file: kind of step, `light` (single lights only), and `number` in the take."""
 
     kind: StepKind
     number: int
@@ -56,10 +56,7 @@ class TakeFrame:
 
 @dataclass(frozen=True)
 class Take:
-    """One take of a set; `subjects` are masks of the subject by camera.
-
-    `response` is how the files hold light.
-    """
+    """One take; `subjects` are masks of the subject by camera, `response` the files' encoding."""
 
     geometry: Geometry
     frames: list[TakeFrame]
@@ -69,7 +66,7 @@ class Take:
 
 @dataclass(frozen=True)
 class PresetFiles:
-    """What a user gives beside the folder: `cameras` and `lights` where they are elsewhere."""
+    """The user's folder, take, and files of `cameras` and `lights` outside the folder."""
 
     folder: Path
     take: str | None = None
@@ -78,17 +75,17 @@ class PresetFiles:
 
 
 Files = dict[str, dict[int, Path]]
-"""By camera and by the number that ends the file's name."""
+"""Files by camera and by the number at the end of their names."""
 Mean = Callable[[Path], float]
-"""Mean light of a picture; its unit does not matter."""
+"""Mean light of an image, in any unit."""
 
 
 def read_preset(
     preset: Preset, files: PresetFiles, mean: Mean, given: Mapping[str, Any] = MappingProxyType({})
 ) -> Take:
-    """The take in `files.folder`; `given` fields of `PlacementOptions` stand for the preset's own.
+    """The take in `files.folder`; `given` fields of `PlacementOptions` replace the preset's.
 
-    Raises `ValueError` (`PresetProblem`, those of camera and light files) that says what is amiss.
+    Raises `ValueError` (`PresetProblem`, and those of camera and light files).
     """
     if not files.folder.is_dir():
         raise PresetProblem(f"{files.folder}: no such folder")
@@ -96,7 +93,7 @@ def read_preset(
 
 
 def understood(take: Take) -> tuple[ImportSettings, Found]:
-    """The take as `Import.of` wants it: a step for each number, in the order of shooting."""
+    """The take as arguments of `Import.of`: a step for each number, in capture order."""
     rank = {(f.number, f.kind, f.light): f for f in take.frames}
     keys = sorted(rank, key=lambda k: (k[0], k[1], k[2] or ""))
     steps = [Step(i, kind, 1.0, light=light) for i, (_, kind, light) in enumerate(keys)]
@@ -108,12 +105,12 @@ def understood(take: Take) -> tuple[ImportSettings, Found]:
 
 
 def mean_light(path: Path) -> float:
-    """Mean light of a picture, by what its format says of its numbers."""
+    """Mean linear light of an image."""
     return float(read_picture(path, Sensor(), picture_size(path)).light.mean())
 
 
 def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
-    """`CamNN/IDxxxxx/IDxxxxx.NNNNNN.*`, and of the repository: `--cameras calibration/cameras/
+    """`CamNN/IDxxxxx/IDxxxxx.NNNNNN.*`, and from the repository `--cameras calibration/cameras/
     NNN.xml --lights relighting/lights/light_pattern_metadata.json`, with `..._per_frame.json`.
     """
     taken = _takes(files, files.folder, "CamNN/ID20001/ID20001.000001.exr")
@@ -142,8 +139,8 @@ def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
 def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     """A pose: `images_processed` or `images_raw/CamNN/ID.NNN.avif`, and `../shared` of its subject.
 
-    Processed pictures are undistorted already; frame 0 is white light, 1 to 13 are gradients and
-    environments, from 13 or 14 on single lights follow.
+    Processed images are undistorted; frame 0 is white light, 1 to 13 are gradients and
+    environments, single lights follow from 13 or 14 on.
     """
     folder, shared = files.folder, files.folder.parent / "shared"
     pictures = next(
@@ -162,7 +159,7 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
     try:
         turns = [int(w) - 1 for w in plain_file(spiral).read_text().split()]
     except (OSError, ValueError) as error:
-        raise PresetProblem(f"{spiral}: expected a light's number a line ({error})") from error
+        raise PresetProblem(f"{spiral}: expected one light number per line ({error})") from error
     order = with_fully_lit(turns)
     where = replace(PlacementOptions(unit="mm", light_unit="m", up="y"), **given)
     geometry = _placed(cameras, lights, where)
@@ -170,7 +167,9 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
     hatch = {geometry.lights[i].name for i in HATCH if i < len(geometry.lights)}
     kept = [light for light in geometry.lights if light.name not in hatch]
     frames = [f for f in frames if f.light not in hatch]
-    notes.append(f"{len(hatch)} lights on the stage's door are left out: their places are not sure")
+    notes.append(
+        f"{len(hatch)} lights on the stage's door are skipped: their positions are inaccurate"
+    )
     zero = _span(taken)[0]
     white = [
         TakeFrame("all_on", zero, c, paths[zero])
@@ -188,7 +187,7 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
 
 def _given(path: Path | None, example: str) -> Path:
     if path is None:
-        raise PresetProblem(f"give {example}, of the set's repository")
+        raise PresetProblem(f"give {example} from the data set's repository")
     return path
 
 
@@ -201,7 +200,7 @@ def _placed(cameras: CameraFile, lights: LightFile, where: PlacementOptions) -> 
 
 
 def _takes(files: PresetFiles, root: Path, example: str, deep: bool = True) -> Files:
-    """The files of the take that is asked for."""
+    """The files of the requested take."""
     folders = sorted(p for p in root.glob("Cam*") if p.is_dir())
     if not folders:
         raise PresetProblem(f"{root}: expected {example}")
@@ -210,7 +209,7 @@ def _takes(files: PresetFiles, root: Path, example: str, deep: bool = True) -> F
         take = files.take or (takes[0] if len(takes) == 1 else None)
         if take not in takes:
             shown = ", ".join(takes[:8]) or "none"
-            raise PresetProblem(f"{root}: give --take; there are {shown}")
+            raise PresetProblem(f"{root}: give --take, one of {shown}")
         folders = [f / str(take) for f in folders]
     out: Files = {}
     for place in folders:
@@ -227,21 +226,23 @@ def _takes(files: PresetFiles, root: Path, example: str, deep: bool = True) -> F
 def _sequence(
     taken: Files, geometry: Geometry, order: Sequence[int], mean: Mean, skip: int
 ) -> tuple[list[TakeFrame], list[str]]:
-    """Frames of the cameras that have a pose: the pattern stands where the brightness says.
+    """Frames of the cameras with a pose; the pattern is located by brightness.
 
-    It is looked for after the first `skip` files. A file that is not there is no frame.
+    The first `skip` files are not part of it. Missing files are missing frames.
     """
     highest = max(order)
     if highest >= len(geometry.lights):
-        raise PresetProblem(f"the pattern has {highest + 1} lights, {len(geometry.lights)} stand")
+        raise PresetProblem(
+            f"the pattern has {highest + 1} lights, the file of lights {len(geometry.lights)}"
+        )
     posed = [c for c in taken if c in geometry.cameras]
     notes = []
     if without := [c for c in taken if c not in geometry.cameras]:
-        notes.append(f"no pose for {', '.join(without)}: left out")
+        notes.append(f"{', '.join(without)}: no pose, skipped")
     if not posed:
-        raise PresetProblem(f"no camera of {', '.join(taken)} has a pose")
+        raise PresetProblem(f"none of the cameras {', '.join(taken)} has a pose")
     if unused := [str(c) for c in geometry.cameras if c not in taken]:
-        notes.append(f"no pictures of {', '.join(unused)}: left out")
+        notes.append(f"{', '.join(unused)}: no images, skipped")
     numbers = range(*_span(taken))
     pattern = find_pattern(_brightness(taken, posed, numbers, mean)[skip:], order)
     start = numbers[0] + skip + pattern.start
@@ -250,8 +251,8 @@ def _sequence(
     wrong = {numbers[0] + skip + i for i in pattern.wrong}
     if wrong:
         notes.append(
-            f"frames {', '.join(map(str, sorted(wrong)))} are brighter or darker than the pattern "
-            "has them: left out"
+            f"frames {', '.join(map(str, sorted(wrong)))}: brightness contradicts the pattern, "
+            "skipped"
         )
     frames = []
     for camera in posed:
@@ -270,17 +271,19 @@ def _shot(geometry: Geometry, taken: Files) -> dict[str | int, Camera]:
 
 
 def _span(taken: Files) -> tuple[int, int]:
-    """The first number and the one after the last."""
+    """The first number, and one past the last."""
     numbers = [n for files in taken.values() for n in files]
     if max(numbers) - min(numbers) > 10 * len(set(numbers)):
-        raise PresetProblem(f"files are numbered from {min(numbers)} to {max(numbers)}: no take")
+        raise PresetProblem(
+            f"files are numbered from {min(numbers)} to {max(numbers)}: not one take"
+        )
     return min(numbers), max(numbers) + 1
 
 
 def _brightness(taken: Files, posed: Sequence[str], numbers: Sequence[int], mean: Mean) -> Array:
-    """Mean of the files of three cameras that are spread over the stage `(N,)`, each over its own.
+    """Mean brightness `(N,)` of three cameras spread over the stage, each relative to its median.
 
-    A frame that none of them has is as bright as most.
+    A frame that none of them has counts as 1.
     """
     chosen = posed[:: max(1, len(posed) // 3)][:3]
     value = np.array(

@@ -1,4 +1,4 @@
-"""Light that a camera's dark frames hold: no lamp sent it, so it is no answer to one."""
+"""Stray light in a camera's dark frames."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import numpy as np
 from reconstruction.arrays import Floats
 
 WINDOW = 5
-"""Pixels a side of the means that tell stray light from noise."""
+"""Side in pixels of the means that separate stray light from noise."""
 
 
 def stray_light(dark: Floats) -> Floats | None:
-    """What of a `dark` frame `(H, W, 3)`, or a mean of some, is light; None where nothing is.
+    """Stray light `(H, W, 3)` in a `dark` frame, or a mean of several; None without any.
 
-    It is light where its mean over `WINDOW` × `WINDOW` pixels is more than the noise of one pixel;
-    elsewhere it is 0: less would bring its own noise into every frame that it is taken off.
-    Raises `ValueError` for NaN.
+    It is the frame where its mean over `WINDOW`² pixels exceeds the noise of one pixel, else 0:
+    subtracting more would add noise to every frame. Raises `ValueError` for NaN.
     """
     if np.isnan(dark).any():
         raise ValueError("a dark frame has values that are not numbers")

@@ -1,4 +1,4 @@
-"""Re-reading a whole capture folder and saying what is wrong with it."""
+"""Verification of a capture folder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from reconstruction.capture.folder import Capture, CaptureError, FrameRecord
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError, FrameRecord
 from reconstruction.capture.writer import sha256
 from reconstruction.containment import inside
 from reconstruction.files.exr import read_exr
@@ -15,11 +16,10 @@ from reconstruction.report.report import Progress, silent
 
 
 def verify(path: str | Path, progress: Progress = silent) -> list[str]:
-    """Re-read every file of a capture; returns one sentence per problem, none for a sound one.
+    """Re-read every file of a capture; returns one sentence per problem.
 
-    Checked: the small files and the journal against the manifest, every frame against its
-    checksum, that it decodes and has its camera's size, that no planned frame is missing, and
-    that no file lies among the frames that is none.
+    Checked are the small files and the journal against the manifest, every frame's checksum,
+    decoding and size, missing frames, and files under frames/ that the journal does not list.
     """
     path = Path(path)
     try:
@@ -42,8 +42,8 @@ def _journal(journal: Path) -> Iterator[str]:
         yield "journal.jsonl is missing: no frame can be accounted for."
     elif not (b"\n" + journal.read_bytes()).endswith(b"\n"):
         yield (
-            "journal.jsonl ends in a torn line, as a crash while shooting leaves it: the frame it "
-            "was about is not accounted for."
+            "journal.jsonl ends in an incomplete line, as after a crash: its frame is not "
+            "accounted for."
         )
 
 
@@ -85,7 +85,7 @@ def _manifest(capture: Capture) -> Iterator[str]:
 
 
 def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
-    """The record as it is now, where compression has put another file in its place."""
+    """The current record, if compression has replaced the file."""
     assert record.file is not None
     if capture.file_of(record).exists():
         return record
@@ -94,7 +94,7 @@ def _now(capture: Capture, record: FrameRecord) -> FrameRecord:
 
 
 def _left_over(path: Path) -> Iterator[str]:
-    """Files that an interrupted write or compression left; none can be told while one goes on."""
+    """Files left by an interrupted write or compression; not checked while one runs."""
     journal = path / "journal.jsonl"
     if not journal.is_file():
         return
@@ -103,11 +103,11 @@ def _left_over(path: Path) -> Iterator[str]:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return
-        strangers = [str(p.relative_to(path)) for p in Capture(path).strangers()]
-    if strangers:
+        unlisted = [str(p.relative_to(path)) for p in Capture(path).unlisted_files()]
+    if unlisted:
         yield (
-            f"{len(strangers)} files among the frames are in no line of the journal, left by a "
-            f"write or a compression that was interrupted; the first is {strangers[0]}."
+            f"{len(unlisted)} files under frames/ are not listed in the journal, as after an "
+            f"interrupted write or compression; the first is {unlisted[0]}."
         )
 
 
@@ -128,7 +128,7 @@ def _frame(capture: Capture, record: FrameRecord) -> list[str]:
     except ValueError as error:
         return [f"{what} does not decode: {error}."]
     if image.shape != (expected := (camera.height, camera.width, 3)):
-        return [f"{what} has the shape {image.shape}, its camera's is {expected}."]
+        return [f"{what} has the shape {image.shape}, expected {expected}."]
     return []
 
 
@@ -146,6 +146,6 @@ def _absent(capture: Capture) -> Iterator[str]:
     if never:
         step, name = never[0]
         yield (
-            f"{len(never)} planned frames were never shot; the first is step {step.index} "
+            f"{len(never)} planned frames were never captured; the first is step {step.index} "
             f"({step.kind}), {name}."
         )

@@ -1,8 +1,8 @@
 """Writing capture folders: frames first, then their journal lines, the manifest last.
 
-A crash at any moment leaves every frame that the journal names whole: a frame's file and its name
-are flushed before its line is appended and flushed. `reopen` continues such a folder. A full disk
-raises `DiskFull`, before that while there is still room to `finish`.
+Every frame in the journal survives a crash: a frame's file and its name are flushed before its
+line is appended and flushed. `reopen` continues such a folder. `DiskFull` is raised while there is
+still room to `finish`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.arrays import AnyFloats
-from reconstruction.capture.folder import Capture, CaptureError, FrameRecord, Step
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError, FrameRecord, Step
 from reconstruction.containment import inside
 from reconstruction.files.durable import (
     RESERVE,
@@ -45,12 +46,12 @@ from reconstruction.geometry.rig import Rig
 
 
 class JournalInUse(CaptureError):
-    """Somebody else is writing the capture."""
+    """Another process or writer has the capture open."""
 
 
 @dataclass
 class _Stored:
-    """A frame's file that is not committed; `direct`: it went past the page cache."""
+    """An uncommitted frame file; `direct`: written past the page cache."""
 
     path: Path
     temporary: Path
@@ -58,7 +59,7 @@ class _Stored:
 
 
 def require_vacant(path: Path) -> None:
-    """Raise `CaptureError` where no capture may be begun at `path`: it is neither new nor empty."""
+    """Raise `CaptureError` unless `path` is a new or empty folder."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise CaptureError(f"{path}: a capture needs a new or empty folder")
 
@@ -66,8 +67,8 @@ def require_vacant(path: Path) -> None:
 class CaptureWriter:
     """Writes one capture folder; `write_frame` and `record_missing` may be called from any thread.
 
-    Get one from `create` or `reopen`; `reconstruction.capture.folder` describes the layout. It has
-    the folder for itself until `finish` or `close`; `reserve` bytes of the disk stay free.
+    Made by `create` or `reopen`; `reconstruction.capture.folder` describes the layout. The folder
+    is locked until `finish` or `close`; `reserve` bytes of the disk stay free.
     """
 
     def __init__(self, capture: Capture, journal: FileIO) -> None:
@@ -79,8 +80,8 @@ class CaptureWriter:
         self._known = {s.index: s for s in capture.steps}
         self._lock = threading.Lock()
         self._journal = journal
-        self._stored: dict[str, _Stored] = {}  # by the names that their records have
-        self._folders: set[str] = set()  # that are there
+        self._stored: dict[str, _Stored] = {}  # by the file names of their records
+        self._folders: set[str] = set()  # that exist
         self._disk = FileSystem(capture.path)
         self._of_thread = threading.local()
 
@@ -97,7 +98,7 @@ class CaptureWriter:
     ) -> Self:
         """Start a capture in the new or empty folder `path`.
 
-        `plan["steps"]` lists `Step.to_dict()`s (or `Step`s); what else the plan holds is kept.
+        `plan["steps"]` lists `Step.to_dict()`s (or `Step`s); other fields of the plan are stored.
         `masks` maps camera names to hair masks `(H, W)`, boolean or 0..255, `subjects` to masks of
         hair, head and body. Raises `CaptureError`.
         """
@@ -109,7 +110,7 @@ class CaptureWriter:
         indices = [s.index for s in steps]
         if len(set(indices)) != len(indices):
             twice = sorted({i for i in indices if indices.count(i) > 1})[:5]
-            raise CaptureError(f"plan.json: step indices must be distinct, twice: {twice}")
+            raise CaptureError(f"plan.json: duplicate step indices {twice}")
         images = {
             f"{folder}/{name}.png": _mask(rig, name, mask)
             for folder, given in (("masks", masks), ("subjects", subjects))
@@ -134,9 +135,9 @@ class CaptureWriter:
 
     @classmethod
     def reopen(cls, path: str | Path) -> Self:
-        """Continue a capture that was interrupted: a torn last journal line is cut off, the
-        manifest, if there is one, is removed until `finish` writes it anew. Raises `CaptureError`
-        where there is no capture, or another process writes or compresses it."""
+        """Continue an interrupted capture: an incomplete last journal line is cut off, a manifest
+        is removed until `finish`. Raises `CaptureError` if there is no capture, or another process
+        has it open."""
         before = Capture(path)
         for folder in (
             "masks",
@@ -147,18 +148,18 @@ class CaptureWriter:
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        for left_over in capture.strangers():
-            if left_over.suffix == ".exr":  # perhaps torn: a name that is in no line yet
+        for left_over in capture.unlisted_files():
+            if left_over.suffix == ".exr":  # possibly incomplete
                 left_over.unlink()
         return cls(capture, journal)
 
     def missing(self) -> list[tuple[Step, str]]:
-        """The frames (step, camera) that are not there yet, in the plan's order."""
+        """The frames (step, camera) not yet written, in the plan's order."""
         return [(s, c.name) for s in self.steps for c in self.rig.cameras if not self._has(s, c)]
 
     def counts(self) -> tuple[int, int]:
-        """Frames written, and frames recorded as missing, so far; waits for no disk."""
-        records = list(self.records.values())  # at once: no other thread runs meanwhile
+        """Frames written and frames recorded as missing so far; does not wait for the disk."""
+        records = list(self.records.values())  # atomic
         written = sum(r.file is not None for r in records)
         return written, len(records) - written
 
@@ -175,8 +176,8 @@ class CaptureWriter:
 
         `radiance (H, W, 3)` is scene-linear, W/(sr m²), as exposed at the step's level;
         `full_scale` is the radiance at which a channel saturates (inf: never), `count_scale` the
-        radiance of one count (0: not quantised). Raises `CaptureError` for a frame of the wrong
-        size, with numbers that are not finite, of an unknown step, or written before.
+        radiance of one count (0: not quantised). Raises `CaptureError` for a wrong size, values
+        that are not finite, an unknown step, or a frame that is already written.
         """
         scales = {"full_scale": full_scale, "count_scale": count_scale}
         record = self.store_frame(step, camera, radiance, **scales)
@@ -192,10 +193,10 @@ class CaptureWriter:
         full_scale: float = math.inf,
         count_scale: float = 0.0,
     ) -> FrameRecord:
-        """Write a frame's file; `commit` makes it durable and a part of the capture.
+        """Write a frame's file; `commit` makes it durable and part of the capture.
 
-        Several threads may store side by side. Arguments and errors as `write_frame`, `DiskFull`
-        where the disk has no room for it beside the reserve.
+        Thread-safe. Arguments and errors as `write_frame`; `DiskFull` if the file would use the
+        reserve.
         """
         self._check(step, camera)
         expected = (self.rig.camera(camera).height, self.rig.camera(camera).width, 3)
@@ -204,7 +205,9 @@ class CaptureWriter:
                 f"step {step.index}, {camera}: expected an image {expected}, got {radiance.shape}"
             )
         if not np.isfinite(radiance).all():
-            raise CaptureError(f"step {step.index}, {camera}: the frame is not finite everywhere")
+            raise CaptureError(
+                f"step {step.index}, {camera}: the frame has values that are not finite"
+            )
         attributes: dict[str, float | str] = {"exposureTime": float(step.exposure)}
         if math.isfinite(full_scale):
             attributes["fullScale"] = float(full_scale)
@@ -226,14 +229,14 @@ class CaptureWriter:
         return FrameRecord(step.index, camera, name, checksum, recorded=utc_now())
 
     def commit(self, records: Sequence[FrameRecord]) -> None:
-        """Make the records part of the capture: flush the files and their names, then the journal.
+        """Make the records part of the capture: flush files and names, then the journal.
 
-        A disk flushes many files together as fast as one: commit what has gathered.
+        Flushing many files together takes about as long as flushing one.
         """
         names = [r.file for r in records if r.file is not None]
         files = [self._stored[name] for name in names]
         if len(files) > 1 and self._disk.supported and all(f.direct for f in files):
-            for file in files:  # as long as no line names it, a file counts for nothing
+            for file in files:  # not part of the capture before its journal line
                 file.temporary.replace(file.path)
             self._disk.flush()
         else:
@@ -249,7 +252,7 @@ class CaptureWriter:
                 del self._stored[name]
 
     def _buffer(self, shape: tuple[int, ...]) -> UncompressedExr:
-        """A file in memory of this thread's own, made once."""
+        """This thread's file buffer, made once."""
         buffer: UncompressedExr | None = getattr(self._of_thread, "buffer", None)
         if buffer is None or buffer.shape != shape:
             buffer = self._of_thread.buffer = UncompressedExr(shape[0], shape[1])
@@ -258,7 +261,7 @@ class CaptureWriter:
     def record_missing(
         self, step: Step, camera: str, *, reason: str, pulse: int | None = None, attempt: int = 0
     ) -> FrameRecord:
-        """Journal that a frame did not come and why; a later `write_frame` of it still counts."""
+        """Journal a missing frame and why; a later `write_frame` replaces the record."""
         self._check(step, camera)
         record = FrameRecord(step.index, camera, None, pulse=pulse, attempt=attempt, reason=reason)
         record = replace(record, recorded=utc_now())
@@ -266,7 +269,7 @@ class CaptureWriter:
         return record
 
     def withdraw(self, step: Step, camera: str, *, reason: str) -> None:
-        """Take a frame back that was written: it counts as missing, and may be written again."""
+        """Mark a written frame as missing and delete its file; it may be written again."""
         record = self.records.get((step.index, camera))
         if record is None or record.file is None:
             return
@@ -277,9 +280,9 @@ class CaptureWriter:
     def finish(self, outcome: str, extra: dict[str, Any] | None = None) -> dict[str, Any]:
         """Write `manifest.json`, close the journal and return the manifest.
 
-        It holds `state` ("done"), `outcome`, frame counts, checksums of the small files and of the
-        journal, whose lines hold the frames' checksums, and whatever `extra` adds. Frames that
-        were stored and never committed are removed. Raises `OSError` where even that finds no room.
+        It has `state` ("done"), `outcome`, frame counts, checksums of the small files and of the
+        journal (which has the frames' checksums), and `extra`. Uncommitted frames are removed.
+        Raises `OSError` on a full disk.
         """
         self.close()
         manifest = {
@@ -299,7 +302,7 @@ class CaptureWriter:
         return manifest
 
     def close(self) -> None:
-        """Close the journal without a manifest: the folder stays an interrupted capture."""
+        """Close the journal without a manifest; the capture counts as interrupted."""
         with self._lock:
             self._journal.close()
             for file in self._stored.values():
@@ -315,14 +318,14 @@ class CaptureWriter:
         if self._known.get(step.index) != step:
             raise CaptureError(f"step {step.index}: {step} is not in this capture's plan")
         if self._has(step, self.rig.camera(camera)):
-            raise CaptureError(f"step {step.index}, {camera}: this frame is written already")
+            raise CaptureError(f"step {step.index}, {camera}: this frame is already written")
 
 
 def open_journal(path: Path) -> FileIO:
-    """Open the journal of the capture at `path` to append to it, for this process alone.
+    """Open and lock the journal of the capture at `path` for appending.
 
-    What a crash or a full disk left of a last line is cut off. Raises `CaptureError` where
-    another process (or another writer of this one) has it open.
+    An incomplete last line is cut off. Raises `JournalInUse` if another process, or another writer
+    of this one, has it open.
     """
     file = inside(path, "journal.jsonl")
     journal = file.open("ab", buffering=0)
@@ -330,14 +333,16 @@ def open_journal(path: Path) -> FileIO:
         fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         journal.close()
-        raise JournalInUse(f"{path}: it is being written or compressed; wait for that") from None
+        raise JournalInUse(
+            f"{path}: it is being written or compressed; wait until that ends"
+        ) from None
     data = file.read_bytes()
     journal.truncate(data.rfind(b"\n") + 1)
     return journal
 
 
 def append_lines(journal: FileIO, records: Sequence[FrameRecord]) -> None:
-    """Append records to an open journal and flush it to disk; all of them or none."""
+    """Append records to an open journal and flush it; all or none."""
     lines = []
     for record in records:
         line = {k: v for k, v in vars(record).items() if v is not None}
@@ -358,10 +363,10 @@ def utc_now() -> str:
 
 
 def checksums(path: Path) -> dict[str, Any]:
-    """Checksums of the small files, and of the journal as long as it is now.
+    """Checksums of the small files and of the journal at its current length.
 
-    Compression appends to the journal before it renews the manifest; the length lets `verify`
-    check the part that the manifest knows.
+    Compression appends to the journal before it updates the manifest; by the length `verify` checks
+    the part that the manifest covers.
     """
     small = [path / n for n in ("rig.json", "plan.json", "head.obj")]
     small += sorted([f for name in ("masks", "subjects") for f in (path / name).glob("[!.]*.png")])

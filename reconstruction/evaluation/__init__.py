@@ -1,1 +1,1 @@
-"""Strands beside the truth: matching, visibility, connectivity, regions, baselines."""
+"""Evaluation of strands: matching, visibility, connectivity, baselines."""

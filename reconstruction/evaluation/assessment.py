@@ -1,4 +1,4 @@
-"""Everything there is to say of strands beside the true ones; `hairstage evaluate geometry`."""
+"""All scores of strands against the true ones; `hairstage evaluate geometry`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.growth.hair_envelope import pixel_size
 from reconstruction.report.report import Progress, silent
 
-ROOTED = 5e-3  # metres: a strand that ends this near the scalp reaches it
-OTHER_UNITS = 10.0  # sizes that differ by this factor are hardly those of one head
+ROOTED = 5e-3  # metres: largest distance of a rooted strand from the scalp
+OTHER_UNITS = 10.0  # ratio of sizes that suggests different units
 
 
 class Nearest:
@@ -39,7 +39,7 @@ class Nearest:
         self.cosine = np.zeros(count)
 
     def look(self, block: Block) -> None:
-        """Keep the points of `block` that are nearer than those so far."""
+        """Update with the points of `block`."""
         distance, j = block.tree.query(self.drawn.points, workers=-1)
         closer = np.flatnonzero(distance < self.distance)
         j = j[closer]
@@ -48,11 +48,11 @@ class Nearest:
 
     @property
     def angle_deg(self) -> Array:
-        """Between the tangents as lines, 0 to 90 `(N,)`."""
+        """Angle `(N,)` between the undirected tangents, 0 to 90."""
         return np.degrees(np.arccos(np.minimum(np.abs(self.cosine), 1.0)))
 
     def figures(self) -> dict[str, Any]:
-        """Spread of distance and angle; the share whose nearest point runs the other way."""
+        """Spread of distance and angle; share of nearest points with the opposite direction."""
         return {
             "distance_mm": spread(1e3 * self.distance),
             "angle_deg": spread(self.angle_deg),
@@ -62,7 +62,7 @@ class Nearest:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """`figures` are JSON-ready; the rest is what pictures are made of."""
+    """`figures` are JSON-ready; `pred` and `true` are for images."""
 
     figures: dict[str, Any]
     pred: Nearest
@@ -79,32 +79,32 @@ def assess_strands(
     samples: int | None = 40_000,
     progress: Progress = silent,
 ) -> Assessment:
-    """Score predicted strands against the true ones, in every way this project knows.
+    """Score predicted strands against the true ones.
 
-    The figures are those of `compare_strands` and, beside them,
+    The figures are those of `compare_strands` and
 
     - `errors.{pred,true}`: distance and angle between each point and the nearest of the other set
-      (mean and percentiles), and the share whose nearest point runs the other way;
-    - `roots.{pred,true}`: the share of strands whose root is within 5 mm of the scalp (`rooted`)
-      and of those whose tip is and the root is not (`upside_down`). The scalp is what the head
-      marks as such, or else the true roots (`roots.scalp` says which);
-    - `true_directions`, where `cameras` are given: what `true_direction_figures` returns;
-    - `warnings`: sentences about what looks wrong with the input.
+      (mean and percentiles), and the share whose nearest point has the opposite direction;
+    - `roots.{pred,true}`: the share of strands with their root within 5 mm of the scalp (`rooted`)
+      and with their tip there instead (`upside_down`). `roots.scalp` is "marked" by the head or
+      "true roots";
+    - `true_directions`, with `cameras`: see `true_direction_figures`;
+    - `warnings`: sentences on suspicious input.
 
     Raises as `compare_strands` does.
     """
-    progress("what the cameras see", 0.0)
+    progress("visibility", 0.0)
     visibility = Visibility(cameras, true, head) if cameras is not None and len(true) else None
     comparison = StrandComparison(pred, true, seed=seed, samples=samples, visibility=visibility)
     of_pred, of_true = (Nearest(matches.drawn) for matches in comparison.all)
-    progress("predicted points among the true ones", 0.1)
-    comparison.look_at_truth(of_pred)
-    progress("true points among the predicted ones", 0.3)
-    comparison.look_at_prediction(of_true)
+    progress("matching predicted points", 0.1)
+    comparison.match_predicted(of_pred)
+    progress("matching true points", 0.3)
+    comparison.match_true(of_true)
     warnings = input_warnings(pred, true)
     figures = comparison.figures()
     if cameras is not None:
-        progress("with the true directions over a pixel", 0.7)
+        progress("true directions", 0.7)
         figures["true_directions"] = true_direction_figures(
             pred, true, cameras, visibility=visibility, seed=seed, samples=samples
         )
@@ -113,7 +113,7 @@ def assess_strands(
         "roots": root_figures(pred, true, head),
         "warnings": warnings,
     }
-    progress("judged", 1.0)
+    progress("evaluated", 1.0)
     return Assessment(figures, of_pred, of_true)
 
 
@@ -126,11 +126,10 @@ def true_direction_figures(
     seed: int = 0,
     samples: int | None = 40_000,
 ) -> dict[str, Any]:
-    """What `pred` would score with the true directions over a pixel (`with_true_directions`).
+    """Scores of `pred` with the true directions over a pixel (`with_true_directions`).
 
-    A pixel is as wide as at the middle of the true strands, the median over `cameras`. Returns the
-    `visible`, `all` and `equal_length` of `compare_strands`, and raises as it does: that pieces are
-    many and lie on no one strand says nothing.
+    The pixel width is the median over `cameras` at the middle of the true strands. Returns the
+    `visible`, `all` and `equal_length` of `compare_strands` and raises as it does.
     """
     pixel = pixel_size(cameras, true.points.mean(axis=0, dtype=float))
     turned = with_true_directions(pred, true, pixel)
@@ -139,32 +138,34 @@ def true_direction_figures(
 
 
 def input_warnings(pred: Strands, true: Strands) -> list[str]:
-    """What looks wrong with two sets of strands that should be of one head."""
+    """Warnings on two sets of strands that should be of one head."""
     if not len(pred):
-        return ["there are no predicted strands: precision is given as 0"]
+        return ["there are no predicted strands: precision is 0"]
     out = []
     boxes = [np.percentile(s.points, (1, 99), axis=0) for s in (pred, true)]
     mine, theirs = (float(np.linalg.norm(high - low)) for low, high in boxes)
     if max(mine, theirs) > OTHER_UNITS * min(mine, theirs):
         out.append(
-            f"the predicted strands span {mine:.3g} m and the true ones {theirs:.3g} m: are both "
-            "in metres?"
+            f"the predicted strands span {mine:.3g} m, the true ones {theirs:.3g} m: check that "
+            "both are in metres"
         )
     elif _y_up(pred, true):
         out.append(
-            "the predicted strands would lie where the true ones do, were they turned from y up to "
-            "z up, (x, -z, y): are both z up?"
+            "the predicted strands fit the true ones after conversion from y up to z up, "
+            "(x, -z, y): check that both are z up"
         )
     elif (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any():
-        out.append("the predicted strands lie beside the true ones: are both in one frame?")
+        out.append(
+            "the predicted and the true strands do not overlap: check that both are in one frame"
+        )
     still = int((pred.lengths() == 0).sum())
     if still:
-        out.append(f"{still} of {len(pred)} predicted strands have no length, and so no direction")
+        out.append(f"{still} of {len(pred)} predicted strands have zero length")
     return out
 
 
 def _y_up(pred: Strands, true: Strands) -> bool:
-    """Whether `pred`, turned from y up to z up, lies at most half as far from `true`."""
+    """Whether conversion from y up to z up halves the distance of `pred` from `true`."""
     mine, theirs = (s.points[:: max(len(s.points) // 5000, 1)] for s in (pred, true))
     turned = mine[:, (0, 2, 1)] * np.array((1, -1, 1), np.float32)
     as_it_is, then = (
@@ -175,7 +176,7 @@ def _y_up(pred: Strands, true: Strands) -> bool:
 
 
 def root_figures(pred: Strands, true: Strands, head: Mesh | None = None) -> dict[str, Any]:
-    """Which strands reach the scalp, as `assess_strands` says."""
+    """Shares of strands that reach the scalp, see `assess_strands`."""
     marked = head is not None and head.scalp is not None and bool(head.scalp.any())
     out: dict[str, Any] = {"scalp": "marked" if marked else "true roots"}
     if head is not None and marked:

@@ -1,8 +1,7 @@
-"""Strands to compare with: two that no method made, and what exact directions would score.
+"""Baselines from masks and head alone, and an upper bound from exact directions.
 
-A table of precision and recall says little beside an empty page. These two baselines know the masks
-and the head and nothing else, and fill the hull so densely that a true point in it always has a
-line within 1 mm: what they lose, they lose by direction and by the hull's excess over the hair.
+The baselines fill the hull so densely that every point in it is within 1 mm of a line: their errors
+come from directions and from the hull's excess volume.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from reconstruction.growth.field import DOWN, descent, solve_field
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 
 SPACING = np.sqrt(2) * 1e-3
-"""Metres between neighbouring lines: no point between them is over 1 mm from the nearest."""
+"""Metres between neighbouring lines: every point is within 1 mm of one."""
 
 RADIUS = 3.5e-4
 
@@ -35,10 +34,10 @@ def baseline_hull(
     *,
     spacing: float = 2e-3,
 ) -> VoxelGrid:
-    """Where hair can be by `masks[camera.name] (H, W)` of the hair, and a head if there is one.
+    """The possible volume of hair from `masks[camera.name] (H, W)` of the hair and a head.
 
-    The visual hull of hair and head together, less the head's inside, and less what would stand in
-    front of a pixel that shows no hair. Without a head it is the visual hull of the masks alone.
+    The visual hull of hair and head, without the head's inside and without voxels in front of
+    pixels that show no hair. Without a head, the visual hull of the masks.
     """
     if head is None:
         return visual_hull(cameras, masks, spacing=spacing)
@@ -53,7 +52,7 @@ def baseline_hull(
 
 
 def hull_vertical(hull: VoxelGrid) -> Strands:
-    """The hull filled with vertical lines, `SPACING` metres apart, upper ends first."""
+    """The hull filled with vertical lines `SPACING` metres apart, upper ends first."""
     low, (x, y, _) = _lattice(hull)
     columns = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = hull.index(np.column_stack([columns, np.full(len(columns), low[2])])).T[:2]
@@ -73,11 +72,10 @@ def _lattice(hull: VoxelGrid) -> tuple[Array, list[Array]]:
 
 
 def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
-    """The hull filled with the smooth field of its own surface, in pieces `SPACING` metres long.
+    """The hull filled with a smooth direction field in segments `SPACING` metres long.
 
-    On the outer surface the direction is that of steepest descent, gravity's part in the surface;
-    inwards it is spread as measured orientations are (`solve_field`). Where the hull touches the
-    `head` is no outer surface. Raises `ValueError` for an empty hull.
+    On the outer surface (not where it touches the `head`) the direction is that of steepest
+    descent; inside it is interpolated by `solve_field`. Raises `ValueError` for an empty hull.
     """
     points, tangents = descent(hull, inside_mesh(hull, head) if head is not None else None)
     field, _ = solve_field(hull, points, tangents)
@@ -90,10 +88,10 @@ def hull_smooth_field(hull: VoxelGrid, head: Mesh | None = None) -> Strands:
 
 
 def with_true_directions(strands: Strands, true: Strands, width: float) -> Strands:
-    """`strands` in pieces, each with the mean direction of `true` in its cube of `width` metres.
+    """Segments of `strands` with the mean direction of `true` in their cube of `width` metres.
 
-    No baseline: the truth goes in. What directions would score at these places that are exact, but
-    no finer than `width`. Where no true strand is in the cube a piece keeps its direction.
+    An upper bound: scores of exact directions at a resolution of `width`. Segments without a true
+    strand in their cube keep their direction.
     """
     pieces, dense = strands.resampled(STEP), true.resampled(STEP)
     true_cell, cell = (np.floor(s.points / width).astype(np.int64) for s in (dense, pieces))

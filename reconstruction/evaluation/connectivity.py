@@ -1,4 +1,4 @@
-"""How strands of two sets go together: what of one lies on one of the other, in how many pieces."""
+"""Correspondence of whole strands between two sets."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from reconstruction.evaluation.oriented_points import (
 from reconstruction.geometry.strands import Strands
 
 LIES_ON = THRESHOLDS[1]
-"""A point lies on a strand that has a point within this distance and (undirected) angle of it."""
+"""A point lies on a strand with a point within this distance and undirected angle."""
 
 MOST_STRANDS, MOST_POINTS = 1_000, 60_000
-"""Strands that are followed, and their points: drawn at random from more."""
+"""Most strands sampled, and most of their points."""
 
 PERCENTILES = (5, 25, 50, 75, 95)
 
@@ -33,9 +33,9 @@ def spread(values: Array) -> dict[str, float]:
 def length_figures(pred: Strands, true: Strands) -> dict[str, Any]:
     """Strand lengths of both sets, in millimetres.
 
-    `{"pred": {"strands", "total_m", "mean", "p5", …, "p95"}, "true": the same, "distance_mm"}`:
-    the distance is the first Wasserstein distance of the two distributions, which is the area
-    between their cumulative curves; the spread and the distance are missing without strands.
+    `{"pred": {"strands", "total_m", "mean", "p5", …, "p95"}, "true": the same, "distance_mm"}`;
+    the distance is the first Wasserstein distance of the distributions. Spread and distance are
+    omitted without strands.
     """
     from scipy.stats import wasserstein_distance
 
@@ -53,8 +53,8 @@ def length_figures(pred: Strands, true: Strands) -> dict[str, Any]:
     return out
 
 
-class Followed:
-    """Strands drawn from one set, and which strands of the other lie along each."""
+class SampledStrands:
+    """Strands sampled from one set, and the strands of the other that lie along each."""
 
     def __init__(self, points: OrientedPoints, seed: int = 0) -> None:
         order = np.random.default_rng(seed).permutation(len(points.offsets) - 1)[:MOST_STRANDS]
@@ -67,26 +67,26 @@ class Followed:
         self._other: list[Ints] = []
 
     def look(self, block: Block) -> None:
-        """Take a block of the other set into account; each of its strands is in one block only."""
+        """Process a block of the other set; each of its strands is in one block only."""
         least = np.cos(np.radians(LIES_ON.angle))
         for i, j in near_pairs(self._block.points, block, LIES_ON.distance):
             cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
             hit = np.abs(cosine) > least
-            # a point beside several points of one strand lies on it once
+            # count a point near several points of one strand once
             first, count = block.strand[0], block.strand[-1] - block.strand[0] + 1
             pair = np.unique(i[hit] * count + (block.strand[j[hit]] - first))
             self._point.append(pair // count)
             self._other.append(pair % count + first)
 
     def shares(self) -> Array:
-        """The largest share of each followed strand that lies on one other strand `(N,)`."""
+        """The largest share of each sampled strand that lies on one other strand `(N,)`."""
         which, _, count = self._pairs()
         best = np.zeros(len(self.strands))
         np.maximum.at(best, which, count)
         return best / self._counts
 
     def covered(self) -> Array:
-        """The share of each followed strand that lies on any other strand `(N,)`."""
+        """The share of each sampled strand that lies on any other strand `(N,)`."""
         on_any = np.zeros(len(self._block.points))
         for points in self._point:
             on_any[points] = 1.0
@@ -94,7 +94,7 @@ class Followed:
         return np.asarray(np.add.reduceat(on_any, starts) / self._counts)
 
     def _pairs(self) -> tuple[Ints, Ints, Ints]:
-        """Followed strand (its place), other strand, and how many points of the first lie on it."""
+        """Sampled strand (index), other strand, and the number of points of the first on it."""
         point, other = (
             np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (self._point, self._other)
         )
@@ -104,13 +104,13 @@ class Followed:
         return pair // width, pair % width, count
 
 
-def connectivity_figures(pred: Followed | None, true: Followed) -> dict[str, Any]:
-    """How whole the predicted strands are, by strands of both sets that were followed.
+def connectivity_figures(pred: SampledStrands | None, true: SampledStrands) -> dict[str, Any]:
+    """Correspondence of whole strands, by strands sampled from both sets.
 
-    `pred.on_one`: the largest share of a predicted strand that lies on one true strand: 1 for one
-    that never changes hairs. `true.by_one`: the largest share of a true strand that one predicted
-    strand covers; `true.covered`: that all of them cover together. Each with mean, percentiles and
-    the mean's standard error.
+    `pred.on_one`: the largest share of a predicted strand that lies on one true strand;
+    `true.by_one`: the largest share of a true strand covered by one predicted strand;
+    `true.covered`: the share covered by all of them. Each with mean, percentiles and the mean's
+    standard error.
     """
     out: dict[str, Any] = {"lies_on": LIES_ON.name, "true": {"followed": len(true.strands)}}
     for name, values in (("by_one", true.shares()), ("covered", true.covered())):

@@ -1,4 +1,4 @@
-"""Pictures of how strands differ from the true ones."""
+"""Images of the errors of strands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VIEWS = {
     "right side": ((0, -1, 0), (0, 0, 1)),
     "top": ((1, 0, 0), (0, 1, 0)),
 }
-"""What points right and what points up in each picture; it is looked at against their product."""
+"""Right and up directions of each view, which is along minus their cross product."""
 
 STEPS_MM = (0.0, 1.0, 2.0, 3.0, 5.0)
 STEPS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0)
@@ -30,10 +30,9 @@ GOOD_TO_BAD = ("#0f6e84", "#74b3a2", "#e6c34e", "#dd7438", "#84202f")
 def draw_errors(assessment: Assessment, folder: str | Path) -> list[Path]:
     """Write PNGs into `folder` and return their paths.
 
-    `distance.png`, `angle.png`: the points that were scored, from five sides without perspective
-    (only the nearer half of them), coloured by how far the nearest point of the other set is and by
-    the angle to it. Above are the predicted ones, which are wrong where they are red, below the
-    true ones, which are missing there.
+    `distance.png`, `angle.png`: the scored points in five orthographic views (the nearer half),
+    coloured by distance and angle to the nearest point of the other set. Top row: predicted points,
+    wrong where red; bottom row: true points, missing where red.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +61,7 @@ def _views(
         points = (nearest.drawn.points - middle) / half
         for axes, (view, (right, up)) in zip(row, VIEWS.items(), strict=True):
             towards = points @ np.cross(right, up)
-            order = np.argsort(towards)  # what is nearer hides what is behind it
+            order = np.argsort(towards)  # nearer points are drawn last
             order = order[towards[order] > 0]
             x, y, colour = points[order] @ right, points[order] @ up, values[order]
             colour = np.minimum(colour, 2 * steps[-1])

@@ -1,7 +1,6 @@
-"""Strands as points with tangents at equal steps, a block of whole strands at a time.
+"""Strands as points with tangents at equal steps, generated in blocks of whole strands.
 
-A head of 100,000 strands of 20 cm is 20 million points at 1 mm: they are made when they are looked
-at and then forgotten, so that memory does not grow with the hair.
+100,000 strands of 20 cm are 20 million points at 1 mm; blocks bound the memory.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from scipy.spatial import cKDTree
 from reconstruction.arrays import Bools, Floats, Ints
 from reconstruction.geometry.strands import Resampling, Strands, unit_or_zero
 
-Sees = Callable[[Floats], Bools]
-"""Says which of points `(N, 3)` are visible, `(N,)`; `Visibility` is one."""
+PointTest = Callable[[Floats], Bools]
+"""Which of points `(N, 3)` are visible, `(N,)`; `Visibility` is one."""
 
 STEP = 1e-3  # metres between the points
-BLOCK = 250_000  # points that are made together, whole strands: a longer one makes a longer block
+BLOCK = 250_000  # points of a block, more for a longer strand
 MOST_POINTS = 300_000_000
-"""Four times what 150,000 strands of half a metre have: more is another unit of length."""
+"""Four times the points of 150,000 strands of 0.5 m: more suggests another unit."""
 
-MOST_OF_ONE = 1_000_000  # points of one strand, which are in memory together
+MOST_OF_ONE = 1_000_000  # points of one strand
 MOST_PAIRS = 4_000_000
-"""Neighbour pairs that are looked at together: bounds the memory, not the answer."""
+"""Neighbour pairs processed together; bounds the memory."""
 
-OVERSAMPLING = 5  # points that are tested for visibility, for each visible one that is wanted
+OVERSAMPLING = 5  # points tested per requested visible point
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,11 @@ class Threshold:
 
     @property
     def name(self) -> str:
-        """As in `1mm_10deg`."""
+        """For example `1mm_10deg`."""
         return f"{self.distance * 1e3:g}mm_{self.angle:g}deg"
 
 
-# ascending in both: whoever matches one matches all that follow
+# ascending in both: a match at one is a match at all that follow
 THRESHOLDS = (Threshold(1e-3, 10.0), Threshold(2e-3, 20.0), Threshold(3e-3, 30.0))
 
 
@@ -63,43 +62,43 @@ class Block:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The points, to be found by."""
+        """A tree of the points."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn(Block):
-    """Points to score, and whether they are all that there are to score."""
+    """Points to score; `complete` if they are all points."""
 
     complete: bool
 
 
-class Looker(Protocol):
-    """Learns something about drawn points from all points of the other set."""
+class BlockConsumer(Protocol):
+    """Accumulates results over all blocks of a set."""
 
     def look(self, block: Block) -> None:
-        """Take one block of the other set into account."""
+        """Process one block."""
 
 
 def require_hair(strands: Strands) -> None:
-    """Raise `ValueError` where strands are longer than any hair."""
-    lengths = strands.lengths()  # not counts of points, which integers may not hold
+    """Raise `ValueError` for strands too long to be hair in metres."""
+    lengths = strands.lengths()
     if (together := float(lengths.sum())) > MOST_POINTS * STEP:
         raise ValueError(
-            f"the {len(strands)} strands are {together / 1e3:,.0f} km long together, "
-            f"at most {MOST_POINTS * STEP / 1e3:,.0f} km are compared: are they in metres?"
+            f"the {len(strands)} strands have a total length of {together / 1e3:,.0f} km, limit "
+            f"{MOST_POINTS * STEP / 1e3:,.0f} km: check that they are in metres"
         )
     if (longest := float(lengths.max(initial=0))) > MOST_OF_ONE * STEP:
         raise ValueError(
-            f"the longest strand is {longest:,.0f} m long, at most "
-            f"{MOST_OF_ONE * STEP:,.0f} m are compared: are the strands in metres?"
+            f"the longest strand is {longest:,.0f} m long, limit {MOST_OF_ONE * STEP:,.0f} m: "
+            "check that strands are in metres"
         )
 
 
 class OrientedPoints:
     """`strands` as `count` points, `STEP` apart.
 
-    Raises `ValueError` where strands are longer than any hair.
+    Raises as `require_hair` does.
     """
 
     def __init__(self, strands: Strands) -> None:
@@ -115,7 +114,7 @@ class OrientedPoints:
         self._only: Block | None = None
 
     def blocks(self) -> Iterator[Block]:
-        """All points, strand by strand; a set of one block is made only once."""
+        """All points by strand; a single block is cached."""
         if self._only is not None:
             yield self._only
             return
@@ -130,24 +129,24 @@ class OrientedPoints:
                 self._only = block
             yield block
 
-    def show(self, *lookers: Looker) -> None:
-        """Show every block to all `lookers`."""
+    def feed(self, *consumers: BlockConsumer) -> None:
+        """Pass every block to all `consumers`."""
         for block in self.blocks():
-            for looker in lookers:
-                looker.look(block)
+            for consumer in consumers:
+                consumer.look(block)
 
     def draw(
-        self, samples: int | None, rng: np.random.Generator, sees: Sees | None = None
+        self, samples: int | None, rng: np.random.Generator, visible: PointTest | None = None
     ) -> Drawn:
-        """At most `samples` of the points, or of those that `sees` says are visible."""
+        """At most `samples` random points, or random `visible` points."""
         if samples is None:
             samples = self.count
-        tried = self.count if sees is None else min(self.count, OVERSAMPLING * samples)
+        tried = self.count if visible is None else min(self.count, OVERSAMPLING * samples)
         chosen = np.arange(self.count)
         if tried < self.count:
             chosen = np.sort(rng.choice(self.count, tried, replace=False))
-        if sees is not None:
-            chosen = chosen[sees(self._at(chosen)[0])]
+        if visible is not None:
+            chosen = chosen[visible(self._at(chosen)[0])]
         complete = tried == self.count and len(chosen) <= samples
         if len(chosen) > samples:
             chosen = np.sort(rng.choice(chosen, samples, replace=False))
@@ -167,20 +166,20 @@ class OrientedPoints:
         return Block(self._at(index)[0], tangents, strand)
 
     def _beside(self, index: Ints, strand: Ints) -> tuple[Ints, Ints]:
-        """The points before and after each on its strand; an end stands in for what is not."""
+        """The points before and after each on its strand, or the end itself."""
         first, last = self.offsets[strand], self.offsets[strand + 1] - 1
         return np.maximum(index - 1, first), np.minimum(index + 1, last)
 
 
 def _directions(before: Floats, after: Floats) -> Floats:
-    """Unit vectors `(N, 3)`; 0 where both points coincide."""
+    """Unit vectors `(N, 3)`, 0 for coincident points."""
     return unit_or_zero(after.astype(float) - before).astype(np.float32)
 
 
 def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints]]:
     """Indices `(N,)`, `(N,)` of points and points of `other` at most `reach` metres apart.
 
-    They come in parts of about `MOST_PAIRS`, those of one point together.
+    In parts of about `MOST_PAIRS`, with all pairs of a point in one part.
     """
     if len(points) == 0:
         return

@@ -1,4 +1,4 @@
-"""Which points the cameras see past strands and head: z-buffers from points."""
+"""Visibility of points behind strands and head, by z-buffers of points."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.strands import Resampling, Strands
 
-NARROWEST, WIDEST = 5e-4, 1e-3  # limits, in metres, of the width that a strand hides with
+NARROWEST, WIDEST = 5e-4, 1e-3  # metres: limits of the occluding width of a strand
 MOST_PIXELS = 64_000_000
 CHUNK = 200_000
 
 
 class Visibility:
-    """What each of `cameras` sees past `strands` and `head`.
+    """Visibility in `cameras` of points behind `strands` and `head`.
 
-    A camera sees a point that falls on its image and that lies at most the tolerance (along the
-    camera's axis) behind the nearest part of strands and head in the same pixel of a z-buffer. The
-    z-buffers are made for this: whatever the cameras' own resolution, their pixels span one strand
-    width (twice the median radius, 0.5 to 1 mm) at the strands' median depth.
+    A point is visible in a camera if it projects into its image and lies at most the tolerance
+    (along the camera's axis) behind the nearest part of strands and head in its pixel of a
+    z-buffer. Independent of the cameras' resolution, a pixel spans one strand width (twice the
+    median radius, 0.5 to 1 mm) at the strands' median depth.
 
     Raises as `require_hair` does.
     """
@@ -46,14 +46,15 @@ class Visibility:
             return
         covering = np.any([b.over(head) for b in self._buffers], axis=0)
         if covering.any():
-            spacing = 0.7 * min(b.span for b in self._buffers)  # under √3/2: no pixel is missed
+            # under √3/2, so that no pixel is missed
+            spacing = 0.7 * min(b.span for b in self._buffers)
             part = Mesh(head.vertices, head.faces[covering])
             samples = surface_samples(part, spacing)[0].astype(np.float32)
             for buffer in self._buffers:
                 buffer.splat(samples)
 
     def __call__(self, points: AnyFloats, tolerance: float = 1e-3) -> Bools:
-        """Whether at least one camera sees each of `points (N, 3)`; returns `(N,)`."""
+        """Which of `points (N, 3)` are visible in at least one camera, `(N,)`."""
         out = np.zeros(len(points), bool)
         for buffer in self._buffers:
             todo = np.flatnonzero(~out)
@@ -62,10 +63,9 @@ class Visibility:
 
 
 class _DepthBuffer:
-    """The nearest depth behind every pixel of a finer image of the part that shows the strands.
+    """The nearest depth in every pixel of a pinhole image of the strands and the `head (V, 3)`.
 
-    And the `head (V, 3)`, where there is one: what other strands have beside the true ones may lie
-    behind it. It is a pinhole's image: the camera's own lens only says what falls on its picture.
+    The camera's own lens only determines which points project into its image.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class _DepthBuffer:
             self.scale *= min(1.0, float(np.sqrt(MOST_PIXELS / wanted)))
             width, height = np.ceil(extent * self.scale).astype(int) + 1
             self.shape = (int(height), int(width))
-            # what is nearer than the median is imaged larger: samples there must lie closer
+            # nearer parts are imaged larger and need denser samples
             self.span = float(np.quantile(depth[front], 0.02)) / (focal * self.scale)
             if head is not None:
                 pixels, depth = camera.project(head)
@@ -101,7 +101,7 @@ class _DepthBuffer:
         self.image = (corners - self.low) * self.scale
 
     def _extend(self, pixels: Array) -> None:
-        """Hold `pixels (N, 2)` of the camera too, whose grid stays, where memory allows it."""
+        """Enlarge the buffer to contain `pixels (N, 2)`, if memory allows."""
         if not len(pixels):
             return
         at, size = (pixels - self.low) * self.scale, np.array(self.shape[::-1])
@@ -112,7 +112,7 @@ class _DepthBuffer:
             self.shape = (int(size[1]), int(size[0]))
 
     def _project(self, points: AnyFloats) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
-        """Chunk by chunk: which points, column, row and depth; behind the camera column is -inf."""
+        """By chunk: slice, column, row and depth; behind the camera the column is -inf."""
         for first in range(0, len(points), CHUNK):
             part = slice(first, first + CHUNK)
             x, y, z = self.A @ points[part].astype(np.float32).T + self.b
@@ -131,22 +131,22 @@ class _DepthBuffer:
         (left, top), (right, bottom) = self.image
         for part, x, y, z in self._project(points):
             if self.lens.distorted:
-                seen = (x > -np.inf) & self.lens.inside(self.lens.project(points[part])[0])
+                visible = (x > -np.inf) & self.lens.inside(self.lens.project(points[part])[0])
             else:
-                seen = (x >= left) & (y >= top) & (x < right) & (y < bottom)
+                visible = (x >= left) & (y >= top) & (x < right) & (y < bottom)
             on, flat = self._pixels(x, y)
-            seen[on] &= z[on] <= self.depth[flat] + np.float32(tolerance)
-            out[part] = seen
+            visible[on] &= z[on] <= self.depth[flat] + np.float32(tolerance)
+            out[part] = visible
         return out
 
     def _pixels(self, x: Floats, y: Floats) -> tuple[Bools, Ints]:
-        """Which points fall on the buffer, and the pixels of those."""
+        """Which points project into the buffer, and their pixels."""
         height, width = self.shape
         on = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         return on, y[on].astype(np.int64) * width + x[on].astype(np.int64)
 
     def over(self, mesh: Mesh) -> Bools:
-        """Which faces `(F,)` may cover the buffer: before the camera and over its rectangle."""
+        """Which faces `(F,)` may cover the buffer: in front of the camera, over its rectangle."""
         pixels, depth = self.camera.project(mesh.vertices)
         front = (depth[mesh.faces] > 1e-6).all(axis=1)
         corners = (pixels[mesh.faces] - self.low) * self.scale
@@ -156,7 +156,7 @@ class _DepthBuffer:
 
 
 def _picture(lens: Camera, pinhole: Camera) -> Array:
-    """First and last column and row `(2, 2)` that the picture through `lens` has in `pinhole`'s."""
+    """First and last column and row `(2, 2)` in `pinhole`'s image of the image through `lens`."""
     end = np.array([lens.width, lens.height]) - 0.5
     if not lens.distorted:
         return np.stack([np.full(2, -0.5), end])

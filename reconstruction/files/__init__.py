@@ -1,1 +1,1 @@
-"""Files whole on the disk or not there: EXR, points, strands."""
+"""File formats and durable writes: EXR, images, masks, points, lights, cameras, strands."""

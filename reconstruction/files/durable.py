@@ -1,4 +1,4 @@
-"""Files that are whole on the disk, or not there: written, flushed, renamed."""
+"""Durable, atomic writes: temporary name, flush, rename."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-PART = ".part-"  # what the names of files begin with that are not whole yet
-PAGE = 4096  # bytes; what goes past the page cache starts and ends on a multiple of it
+PART = ".part-"  # prefix of incomplete files
+PAGE = 4096  # bytes; alignment of direct writes
 RESERVE = 256 << 20
-"""Bytes that stay free: for what is under way on other threads, the manifest, the jobs' records."""
+"""Bytes that stay free for other threads' frames, the manifest and the jobs' records."""
 
 
 class DiskFull(OSError):
-    """The disk has no room for a file, or would have no reserve left; names path and bytes."""
+    """The disk has no room for a file and the reserve; names path and bytes."""
 
     def __init__(self, path: Path, needed: int, reserve: int = 0) -> None:
         self.needed, self.free = needed, _free(path)
-        kept = f" and a reserve of {reserve:,}" if reserve else ""
+        extra = f" and a reserve of {reserve:,}" if reserve else ""
         super().__init__(
             errno.ENOSPC,
-            f"No space left on device: {needed:,} bytes are needed{kept}, {self.free:,} are free; "
+            f"No space left on device: {needed:,} bytes are needed{extra}, {self.free:,} are free; "
             "make room, then resume",
             str(path),
         )
 
 
 def require_free(path: Path, needed: int, reserve: int = RESERVE) -> None:
-    """Raise `DiskFull` where a file of `needed` bytes would leave less than `reserve` free."""
+    """Raise `DiskFull` if a file of `needed` bytes would leave less than `reserve` free."""
     if _free(path) < needed + reserve:
         raise DiskFull(path, needed, reserve)
 
 
 @contextmanager
 def naming_full_disk(path: Path, needed: int) -> Iterator[None]:
-    """Turn the bare error of a disk (or a quota) that is full into `DiskFull`."""
+    """Raise `DiskFull` instead of a bare `OSError` for a full disk or quota."""
     try:
         yield
     except OSError as error:
@@ -52,9 +52,8 @@ def naming_full_disk(path: Path, needed: int) -> Iterator[None]:
 def write_pages(path: Path, data: memoryview) -> bool:
     """Write whole pages (memory and length aligned to `PAGE`); `flush` makes them durable.
 
-    They go past the page cache where the file system lets them, which is returned: copying into it
-    and writing back cost more processor time than all else but the checksum. A failed file is
-    removed.
+    Bypasses the page cache, whose copies cost much processor time; returns whether the file system
+    supported that. A failed file is removed.
     """
     direct = getattr(os, "O_DIRECT", 0)
     try:
@@ -82,9 +81,9 @@ def _write(path: Path, data: memoryview, flags: int) -> None:
 
 @contextmanager
 def writing(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """A temporary path to write to; afterwards `path` is whole, and where `durable` on the disk.
+    """A temporary path that is renamed to `path` after the block, flushed first if `durable`.
 
-    Where the block raises, nothing is left of what it wrote; an `OSError` names a file.
+    If the block raises, the temporary file is removed; an `OSError` names a file.
     """
     temporary = part(path)
     try:
@@ -95,12 +94,12 @@ def writing(path: Path, *, durable: bool = True) -> Iterator[Path]:
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename is None:
-            error.filename = str(path)  # of a full disk `write` does not say where
+            error.filename = str(path)  # `write` on a full disk names no file
         raise
 
 
 def write_whole(path: Path, data: bytes, *, durable: bool = True) -> None:
-    """Write a small file: temporary name, flush, rename. A failed one leaves nothing."""
+    """Write a small file atomically."""
     with naming_full_disk(path, len(data)), writing(path, durable=durable) as temporary:
         temporary.write_bytes(data)
 
@@ -112,7 +111,7 @@ def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
 
 
 def append_whole(file: FileIO, data: bytes) -> None:
-    """Append to an unbuffered file and flush it; what fails is cut off again."""
+    """Append to an unbuffered file and flush it; a partial append is cut off."""
     before = os.fstat(file.fileno()).st_size
     try:
         with naming_full_disk(Path(os.fspath(file.name)), len(data)):
@@ -125,23 +124,21 @@ def append_whole(file: FileIO, data: bytes) -> None:
 
 
 def part(path: Path) -> Path:
-    """The temporary name of a file that is not whole yet; by its suffix writers know the format."""
+    """The temporary name of an incomplete file, with the same suffix."""
     return path.with_name(PART + path.name)
 
 
 def replace_durably(temporary: Path, path: Path) -> None:
-    """Flush `temporary` to disk and rename it to `path`: afterwards it is whole or not there."""
+    """Flush `temporary` to disk and rename it to `path`."""
     flush(temporary)
     temporary.replace(path)
 
 
 class FileSystem:
-    """The file system that `folder` is on, whose `flush` makes all files and names on it durable:
-    for many small files a fraction of what a flush of each takes.
+    """The file system of `folder`; `flush` makes all its files durable at once (syncfs).
 
-    Errors of writing back what went through the page cache, from the construction on, are raised by
-    Linux from 5.8 on only: use it for what `write_pages` wrote past it. Raises `OSError`;
-    `supported` is False where the system has no such call.
+    Only for files that `write_pages` wrote past the page cache: before Linux 5.8, syncfs does not
+    report write-back errors. Raises `OSError`; `supported` is False without syncfs.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -151,13 +148,13 @@ class FileSystem:
         self._handle = os.open(folder, os.O_RDONLY)
 
     def flush(self) -> None:
-        """Wait until everything that was written to it is on the disk."""
+        """Wait until all writes are on the disk."""
         if self._library.syncfs(self._handle) != 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number))
 
     def close(self) -> None:
-        """Let go of it; more than once does nothing."""
+        """Close the handle; may be called repeatedly."""
         handle, self._handle = self._handle, -1
         if handle >= 0:
             os.close(handle)
@@ -166,7 +163,7 @@ class FileSystem:
 
 
 def flush(path: Path) -> None:
-    """Make a file's contents durable, or the names in a folder."""
+    """Make a file's contents, or a folder's names, durable."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -181,7 +178,7 @@ def _write_all(handle: int, data: memoryview) -> None:
 
 
 def _free(path: Path) -> int:
-    """Bytes that this user may still write where `path` is, or will be."""
+    """Bytes available to this user at `path`, which need not exist."""
     while True:
         try:
             disk = os.statvfs(path)

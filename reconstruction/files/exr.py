@@ -1,4 +1,4 @@
-"""OpenEXR files in and out: `(H, W, 3)` images and their header attributes."""
+"""OpenEXR files: `(H, W, 3)` images and header attributes."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ Attributes = Mapping[str, float | str]
 
 
 class OtherChannels(ValueError):
-    """A file that is whole, but not of R, G and B."""
+    """A valid file without the channels R, G and B."""
 
 
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
-    """Read R, G and B `(H, W, 3)` and the header attributes that `write_exr` was given.
+    """Read R, G and B `(H, W, 3)`, or Y as grey, and the header attributes of `write_exr`.
 
-    Luminance alone (Y) is grey. Raises `ValueError` that names the file when it is missing, broken
-    or has other channels.
+    Raises `ValueError` naming a file that is missing, broken or has other channels.
     """
     try:
-        with suppress(Exception):  # what else there is, is told below, or read
-            file = OpenEXR.File(str(path))  # faster; channels of several types fail
+        with suppress(Exception):  # other files are handled below
+            file = OpenEXR.File(str(path))  # faster; fails for mixed channel types
             found = file.channels()
             pixels = found["RGBA" if "RGBA" in found else "RGB"].pixels
             return np.ascontiguousarray(pixels[..., :3], np.float32), _own(file)
         file = OpenEXR.File(str(path), separate_channels=True)
         channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # the binding raises bare RuntimeError and MemoryError alike
+    except Exception as error:  # the binding raises RuntimeError and MemoryError
         raise ValueError(f"{path}: cannot be read as OpenEXR ({error})") from error
     colours = "YYY" if set(channels) - {"A"} == {"Y"} else "RGB"
     if not set(colours) <= set(channels) or len({channels[c].shape for c in colours}) > 1:
         there = ", ".join(sorted(channels))
         raise OtherChannels(
-            f"{path}: expected the channels R, G and B of one size, there are {there}: write the "
-            "picture alone, as RGB, without layers"
+            f"{path}: expected channels R, G and B of one size, got {there}: write the "
+            "image as RGB "
+            "without layers"
         )
     return np.stack([channels[c] for c in colours], axis=-1, dtype=np.float32), _own(file)
 
 
 def _own(file: OpenEXR.File) -> dict[str, float | str]:
-    """The header attributes that are numbers and texts."""
+    """Header attributes that are numbers or text."""
     return {k: v for k, v in file.header().items() if isinstance(v, float | str)}
 
 
@@ -61,7 +61,7 @@ def write_exr(
 ) -> None:
     """Write `image (H, W, 3)` losslessly as float32 RGB: temporary name, fsync, rename.
 
-    Raises `OSError` where the disk does not take it; what was written of it is removed then.
+    Raises `OSError`; an incomplete file is removed.
     """
     path = Path(path)
     if image.ndim != 3 or image.shape[2] != 3:
@@ -80,12 +80,12 @@ def write_exr(
 
 
 class UncompressedExr:
-    """An uncompressed RGB float32 file of a fixed size, in memory and used again and again.
+    """A reusable in-memory uncompressed RGB float32 file of a fixed size.
 
-    Several times faster than the general writer and, unlike it, without holding up other threads;
-    the bytes are there to be hashed and written from memory. The layout is "OpenEXR File Layout"
-    (openexr.com): magic, version, attributes, a table of offsets, then for each line its y, its
-    byte count and the planes B, G, R. The lines come last so that the file ends on a page.
+    Several times faster than the general writer, without holding the GIL; the bytes can be hashed
+    and written from memory. The layout is "OpenEXR File Layout" (openexr.com): magic, version,
+    attributes, offset table, then for each line its y, byte count and planes B, G, R. Header
+    padding makes the file end on a page.
     """
 
     def __init__(self, height: int, width: int) -> None:
@@ -99,18 +99,18 @@ class UncompressedExr:
         lines["y"] = np.arange(height)
         lines["bytes"] = 12 * width
         self._pixels = lines["bgr"]
-        self._attributes: Attributes | None = None  # that the header has
+        self._attributes: Attributes | None = None  # of the current header
         self._offsets = self._header_room + line.itemsize * np.arange(height, dtype="<u8")
 
     def fill(self, image: AnyFloats, attributes: Attributes) -> memoryview:
-        """The whole file with `image (H, W, 3)`; valid until the next call.
+        """The file with `image (H, W, 3)`, valid until the next call.
 
-        Raises `ValueError` for attributes that do not fit the header.
+        Raises `ValueError` if the attributes exceed the header.
         """
         if attributes != self._attributes:
             head = _header(self.shape[0], self.shape[1], attributes) + self._offsets.tobytes()
             if len(head) > self._header_room:
-                raise ValueError(f"the attributes do not fit into {HEADER_ROOM}: {attributes}")
+                raise ValueError(f"the attributes exceed {HEADER_ROOM} bytes: {attributes}")
             self._memory[: self._header_room] = head.ljust(self._header_room, b"\0")
             self._attributes = dict(attributes)
         self._pixels[:] = image.transpose(0, 2, 1)[:, ::-1]
@@ -118,7 +118,7 @@ class UncompressedExr:
 
 
 HEADER_ROOM = 1024
-"""Bytes of an uncompressed file that its attributes may take; the fixed ones take under 400."""
+"""Bytes reserved for attributes; the fixed ones take under 400."""
 
 
 def _header(height: int, width: int, attributes: Attributes) -> bytes:
@@ -141,7 +141,7 @@ def _header(height: int, width: int, attributes: Attributes) -> bytes:
     }
     parts = [b"\x76\x2f\x31\x01\x02\0\0\0"]
     for name, (kind, value) in {**own, **fixed}.items():
-        if not 1 <= len(name.encode()) <= 31:  # longer ones need a flag that old readers refuse
+        if not 1 <= len(name.encode()) <= 31:  # longer names need a flag that old readers refuse
             raise ValueError(f"an attribute's name has 1 to 31 bytes, got {name!r}")
         parts.append(f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value)
     return b"".join(parts) + b"\0"

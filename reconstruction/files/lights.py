@@ -1,10 +1,10 @@
-"""Lights as others write them: positions in `.json`, `.csv`, `.npy`, `.obj`-like vertex lists.
+"""Files of light positions: `.json`, `.csv`, `.txt`, `.npy`, `.obj`, `.pc`.
 
-`.json`: a list of positions, a name for each, or a list under `lights`, `light_positions` or
-`positions`; a light may be an object with `position` and what `Light` has of `name` (or `id`),
-`intensity`, `colocated_camera`. `.csv` and `.txt`: x, y, z, before them a name where there is one,
-after them an intensity; a first line may name the columns; beside semicolons a comma is a decimal
-one. `.npy`: (N, 3). `.obj`, `.pc`: lines `v x y z`.
+`.json`: a list of positions, an object of positions by name, or a list under `lights`,
+`light_positions` or `positions`; a light may be an object with `position` and optionally `name` (or
+`id`), `intensity`, `colocated_camera`. `.csv` and `.txt`: optional name, x, y, z, optional
+intensity; optional header line; with semicolons as separators, commas are decimal. `.npy`: (N, 3).
+`.obj`, `.pc`: lines `v x y z`.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from reconstruction.reading import read_json
 
 
 class LightFileError(ValueError):
-    """A file of lights that cannot be used; the message names it, the place and what to do."""
+    """An invalid file of lights; the message names the file, the light and what to do."""
 
 
 @dataclass(frozen=True)
 class LightFile:
-    """Lights as a file has them, in its own units and axes; `notes` for its user.
+    """Lights in the file's units and axes; `notes` are for the user.
 
-    `directions` says that all are 1 from the origin: they are directions, not places.
+    `directions` is whether all are at distance 1 from the origin.
     """
 
     lights: list[Light]
@@ -40,7 +40,7 @@ class LightFile:
 
 
 def read_lights(path: str | Path) -> LightFile:
-    """The lights of a file, by its suffix; of intensity 1 where it says none.
+    """The lights of a file, with intensity 1 if it has none.
 
     Raises `LightFileError` naming the light and the field.
     """
@@ -48,7 +48,7 @@ def read_lights(path: str | Path) -> LightFile:
     readers = {".json": _json, ".csv": _table, ".txt": _table, ".npy": _npy}
     readers |= {".obj": _vertices, ".pc": _vertices}
     if path.suffix.lower() not in readers:
-        raise LightFileError(f"{path}: lights are read from {', '.join(readers)}")
+        raise LightFileError(f"{path}: expected a file of lights ({', '.join(readers)})")
     try:
         entries = readers[path.suffix.lower()](path)
     except OSError as error:
@@ -58,30 +58,28 @@ def read_lights(path: str | Path) -> LightFile:
     except ValueError as error:
         raise LightFileError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     if not entries:
-        raise LightFileError(f"{path}: has no light")
+        raise LightFileError(f"{path}: no lights")
     lights, notes = [], []
     for i, entry in enumerate(entries):
         lights.append(_light(entry, i, f"{path}: light {i + 1}"))
     names = [light.name for light in lights]
     if twice := {n for n in names if names.count(n) > 1}:
-        raise LightFileError(f"{path}: two lights are called {sorted(twice)[0]!r}")
-    told = ["intensity" in entry for entry in entries]
-    if any(told) and not all(told):
-        i = told.index(False)
+        raise LightFileError(f"{path}: two lights have the name {sorted(twice)[0]!r}")
+    with_intensity = ["intensity" in entry for entry in entries]
+    if any(with_intensity) and not all(with_intensity):
+        i = with_intensity.index(False)
         raise LightFileError(
-            f"{path}: light {i + 1} ({lights[i].name}) has no intensity, others have: give all of "
-            "them one, or none"
+            f"{path}: light {i + 1} ({lights[i].name}) has no intensity, others have one: give all "
+            "or none"
         )
-    if not any(told):
-        notes.append(
-            "nothing is known of the lights' intensities: all are 1, radiance is in relative units"
-        )
+    if not any(with_intensity):
+        notes.append("the file of lights has no intensities: all are 1, units are relative")
     away = np.linalg.norm([light.position for light in lights], axis=1)
     return LightFile(lights, notes, len(lights) > 1 and bool(np.abs(away - 1).max() < 1e-4))
 
 
 def from_directions(lights: list[Light], center: Array, distance: float) -> list[Light]:
-    """Lights whose positions are directions, `distance` metres from `center (3,)`."""
+    """Lights at `distance` metres from `center (3,)` in the directions of their positions."""
     return [replace(li, position=center + distance * li.position) for li in lights]
 
 
@@ -90,7 +88,7 @@ def _light(entry: dict[str, Any], i: int, where: str) -> Light:
     if isinstance(name, int) and not isinstance(name, bool) and name >= 0:
         name = f"light_{name:03d}"
     if not isinstance(name, str) or not is_file_name(name):
-        raise LightFileError(f"{where}: {name!r} cannot be a light's name")
+        raise LightFileError(f"{where}: {name!r} is not a valid name")
     position = _three(entry.get("position"), f"{where} ({name}): position")
     intensity = _three(entry.get("intensity", 1.0), f"{where} ({name}): intensity", spread=True)
     beside = entry.get("colocated_camera")
@@ -138,7 +136,7 @@ def _npy(path: Path) -> list[dict[str, Any]]:
     try:
         positions = read_array(path)
     except ValueError as error:
-        raise LightFileError(f"{path}: no NumPy array ({error})") from error
+        raise LightFileError(f"{path}: not a NumPy array ({error})") from error
     if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
         raise LightFileError(f"{path}: expected (N, 3) numbers, got {positions.shape}")
     return [{"position": p} for p in positions]
@@ -150,9 +148,9 @@ def _vertices(path: Path) -> list[dict[str, Any]]:
 
 
 def _table(path: Path) -> list[dict[str, Any]]:
-    text = plain_file(path).read_text(encoding="utf-8-sig")  # as spreadsheets write it
+    text = plain_file(path).read_text(encoding="utf-8-sig")  # byte order mark of spreadsheets
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if any(";" in line for line in lines):  # where numbers have a decimal comma
+    if any(";" in line for line in lines):  # decimal commas
         rows = list(csv.reader([x.replace(",", ".") for x in lines], delimiter=";"))
     elif any("," in line for line in lines):
         rows = list(csv.reader(lines, skipinitialspace=True))
@@ -177,7 +175,7 @@ def _named_row(row: dict[str, str], path: Path) -> dict[str, Any]:
 
 
 def _no_name(word: str) -> bool:
-    """Whether a word is a number that nobody would call a light by: a fraction, or below 0."""
+    """Whether a word is a fraction or negative, and so not a name."""
     try:
         return not float(word).is_integer() or word.startswith("-")
     except (ValueError, OverflowError):
@@ -190,14 +188,14 @@ def _row(words: list[str], path: Path, line: int) -> dict[str, Any]:
         name = words[0].strip()
         if len(words) == 4 and _no_name(name):
             raise LightFileError(
-                f"{path}: row {line} begins with {name}: a light's name, or x before an intensity? "
-                "Name the columns in a first line: x, y, z, intensity"
+                f"{path}: row {line}: {name} is ambiguous, a name or x: add a header line (x, y, "
+                "z, intensity)"
             )
         out["name"], words = int(name) if name.isdecimal() else name, words[1:]
     if len(words) not in (3, 6):
         raise LightFileError(
-            f"{path}: row {line} has {len(words)} columns; expected x, y, z, a name before them or "
-            "not, red, green and blue intensity after them or not"
+            f"{path}: row {line} has {len(words)} columns; expected x, y, z with an optional name "
+            "before and red, green and blue intensity after"
         )
     numbers = [_float(w, path) for w in words]
     out["position"] = numbers[:3]

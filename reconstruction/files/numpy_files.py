@@ -1,4 +1,4 @@
-"""NumPy's files, read only where header, file and archive agree on how large an array is."""
+"""NumPy files, read only if header, file and archive agree on the size of an array."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from reconstruction.containment import plain_file
 
 DEFLATE_AT_BEST = 1032
-"""Bytes that one compressed byte can stand for in a deflated member, at the very most."""
+"""Largest compression ratio of deflate."""
 ANY_SIZE = 1 << 62
-"""Bytes of an archive: poses of a groom are large, and no array is larger than its file allows."""
+"""No limit on the bytes of an archive: arrays cannot exceed their file."""
 PLAIN = "biufU"
-"""Kinds of types without objects."""
+"""Kinds of dtypes without objects."""
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -39,7 +39,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An `.npz` archive; in the block, too, what is wrong with it is a `ValueError`."""
+    """An `.npz` archive; errors, also in the block, become a `ValueError`."""
     try:
         with zipfile.ZipFile(plain_file(path, ANY_SIZE)) as archive:
             yield archive
@@ -47,7 +47,7 @@ def opened(path: Path) -> Iterator[zipfile.ZipFile]:
         raise
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError) as e:
         raise ValueError(f"not a whole .npz archive ({e})") from e
-    except RuntimeError as e:  # encrypted, or packed in a way that is not known
+    except RuntimeError as e:  # encrypted, or an unknown compression
         raise ValueError(f"not a whole .npz archive ({e})") from e
 
 
@@ -57,9 +57,9 @@ def names(archive: zipfile.ZipFile) -> list[str]:
 
 
 def member(archive: zipfile.ZipFile, name: str, kinds: str = PLAIN) -> NDArray[Any]:
-    """One array, of any shape, whose type is of one of the `kinds` (`dtype.kind`).
+    """One array of any shape, of one of the `kinds` (`dtype.kind`).
 
-    Raises `ValueError`, and what `opened` turns into one.
+    Raises `ValueError`, and errors that `opened` converts.
     """
     try:
         info = archive.getinfo(name + ".npy")
@@ -77,12 +77,12 @@ def member(archive: zipfile.ZipFile, name: str, kinds: str = PLAIN) -> NDArray[A
 
 
 def _array(file: IO[bytes], size: int, kinds: str) -> NDArray[Any]:
-    """The array that `file`, of `size` bytes, begins with."""
+    """The array at the start of `file`, of `size` bytes."""
     shape, fortran, dtype = _header(file)
     if dtype.kind not in kinds or dtype.hasobject:
         raise ValueError(f"unexpected type {dtype}")
     if any(n < 0 for n in shape):
-        raise ValueError(f"absurd shape {shape}")
+        raise ValueError(f"invalid shape {shape}")
     expected = math.prod(shape) * dtype.itemsize
     if expected > size:
         raise ValueError(f"shape {shape} of {dtype} needs {expected} bytes, the file has {size}")
@@ -100,5 +100,5 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         if version == (2, 0):
             return npy.read_array_header_2_0(file)
     except (SyntaxError, TokenError, MemoryError, RecursionError) as error:
-        raise ValueError(f"a header that cannot be read ({error})") from error
+        raise ValueError(f"invalid header ({error})") from error
     raise ValueError(f"unknown .npy version {version}")

@@ -1,7 +1,7 @@
-"""Pictures as others' cameras write them: EXR, PNG, TIFF, JPEG and RAW, as linear light.
+"""Images of cameras as linear light: EXR, PNG, TIFF, JPEG, AVIF and RAW.
 
-OpenImageIO reads all but RAW, which rawpy (LibRaw) does, and EXR, whose attributes we keep. The
-size is looked at before a pixel is read: a header may claim what memory cannot hold.
+OpenImageIO reads all but RAW (rawpy), AVIF (OpenCV) and EXR. The size is checked before pixels are
+read, as a header may claim more than memory.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ MOSAICS = {
     "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
 }
 LOSSY = {".jpg", ".jpeg"}
-_AVIF_HEAD = 1 << 16  # bytes that hold an AVIF's boxes
+_AVIF_HEAD = 1 << 16  # bytes with an AVIF's boxes
 FULL = 0.99
-"""Of the way from black to white from which on a channel of whole numbers counts as saturated:
-sensors bend before they end, and a developed picture's white is not sharp."""
+"""Share of the range from black to white at which an integer channel counts as saturated: sensors
+are nonlinear near the end."""
 
 
 class PictureError(ValueError):
-    """A picture that cannot be used; the message names the file and says what to do."""
+    """An image that cannot be used; the message names the file and what to do."""
 
 
 @options
 class Sensor:
-    """How the numbers in a picture become light.
+    """Conversion of image values to light.
 
     `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits,
-    JPEG and AVIF, "linear" for all else. `black` and `white` in the file's own numbers: without
-    light, and where a channel is full; None: what a RAW file says, 0 and the largest of its type (1
-    of floats, which never saturate unless `white`, or EXR's attribute `fullScale`, says so).
-    `bayer`: the colours of the first two rows of a picture that is a sensor's mosaic.
+    JPEG and AVIF, else "linear". `black` and `white` in the file's values: no light, and a full
+    channel; None: those of a RAW file, else 0 and the largest of the type (1 for floats, which
+    saturate only with `white` or the EXR attribute `fullScale`). `bayer`: the colours of the first
+    two rows of a sensor's mosaic.
     """
 
     response: Literal["linear", "srgb"] | Positive | None = None
@@ -65,10 +65,10 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """`light (H, W, 3)`, linear, 1 where a channel is full; `saturated (H, W)`.
+    """Linear `light (H, W, 3)`, 1 for a full channel; `saturated (H, W)`.
 
-    `full` is the light from which on a channel is saturated (inf: never), `quantum (H, W, 3) or ()`
-    the light of one step of the file's numbers.
+    `full` is the light at which a channel is saturated (inf: never), `quantum (H, W, 3) or ()` the
+    light of one step of the file's values.
     """
 
     light: Floats
@@ -78,7 +78,7 @@ class Picture:
 
 
 def picture_size(path: Path) -> Size:
-    """Width and height that the header gives. Raises `PictureError`."""
+    """Width and height from the header. Raises `PictureError`."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".exr":
@@ -87,7 +87,7 @@ def picture_size(path: Path) -> Size:
         if suffix in RAW:
             with rawpy.imread(str(path)) as raw:
                 return int(raw.sizes.width), int(raw.sizes.height)
-    except Exception as error:  # both bindings raise what they please
+    except Exception as error:  # the bindings raise various types
         raise PictureError(_broken(path, error)) from error
     if suffix == ".avif":
         height, width = _avif(path).shape[:2]
@@ -97,44 +97,44 @@ def picture_size(path: Path) -> Size:
 
 
 def exposure_of(path: Path) -> tuple[float, str]:
-    """Seconds, and ISO and f-number in words, that a file says of its shot (EXIF, a RAW file's own,
-    or EXR's `exposureTime` and `expTime`). Raises `PictureError` where it says no seconds."""
+    """Exposure in seconds, and ISO and f-number as text, from EXIF, RAW, or EXR's `exposureTime`
+    and `expTime`. Raises `PictureError` without an exposure."""
     suffix = path.suffix.lower()
     try:
         if suffix in RAW:
             with rawpy.imread(str(path)) as raw:
                 shot = raw.other
-                said = (shot.shutter_speed, shot.iso_speed, shot.aperture)
+                values = (shot.shutter_speed, shot.iso_speed, shot.aperture)
         elif suffix == ".exr":
             header = OpenEXR.File(str(path), header_only=True).header()
-            said = (header.get("exposureTime", header.get("expTime")), 0, 0)
+            values = (header.get("exposureTime", header.get("expTime")), 0, 0)
         else:
             spec = _opened(path).spec()
             names = ("ExposureTime", "Exif:PhotographicSensitivity", "FNumber")
-            said = tuple(spec.getattribute(name) for name in names)
+            values = tuple(spec.getattribute(name) for name in names)
     except PictureError:
         raise
-    except Exception as error:  # both bindings raise what they please
+    except Exception as error:  # the bindings raise various types
         raise PictureError(_broken(path, error)) from error
-    seconds, iso, stop = (float(x or 0) for x in said)
+    seconds, iso, stop = (float(x or 0) for x in values)
     if not 0 < seconds < np.inf:
         raise PictureError(
-            f"{path}: does not say how long it was exposed: give `exposure` in seconds, or "
-            "{exposure} in its name"
+            f"{path}: no exposure time in the file: give `exposure` in seconds, or {{exposure}} in "
+            "the pattern"
         )
     return seconds, f"ISO {iso:g} f/{stop:.3g}"
 
 
 def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
-    """Read a picture of `size`. Raises `PictureError`: another size, broken, no such format."""
+    """Read an image of `size`. Raises `PictureError` for another size or format, or damage."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise PictureError(f"{path}: no format that is read; there are {' '.join(sorted(FORMATS))}")
+        raise PictureError(f"{path}: unknown format; expected {' '.join(sorted(FORMATS))}")
     found = picture_size(path)
     if found != size:
         raise PictureError(
-            f"{path}: {found[0]}x{found[1]} pixels, its camera has {size[0]}x{size[1]}: give a "
-            "picture of that size, or remove this one: a frame may be missing"
+            f"{path}: {found[0]}x{found[1]} pixels, expected {size[0]}x{size[1]} as the camera: "
+            "replace the image, or remove it (a frame may be missing)"
         )
     if suffix == ".exr":
         return _exr(path, sensor)
@@ -151,7 +151,7 @@ def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
 
 
 def _avif(path: Path) -> NDArray[Any]:
-    """Whole numbers `(H, W, 3)`; OpenCV reads what OpenImageIO's wheels do not."""
+    """Integer values `(H, W, 3)`; OpenImageIO's wheels do not read AVIF."""
     how = AS_STORED | cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
     values = cv2.imread(str(path), how)
     if values is None:
@@ -160,7 +160,7 @@ def _avif(path: Path) -> NDArray[Any]:
 
 
 def _avif_white(path: Path) -> float:
-    """Largest count of a file, by its `av1C` box ("AV1 Codec ISO Media File Format", 2.3.3)."""
+    """Largest value, from the `av1C` box ("AV1 Codec ISO Media File Format", 2.3.3)."""
     head = path.read_bytes()[:_AVIF_HEAD]
     at = head.find(b"av1C")
     flags = head[at + 6] if 0 <= at < len(head) - 6 else 0
@@ -177,8 +177,8 @@ def _opened(path: Path) -> Any:
 
 
 def _broken(path: Path, error: object) -> str:
-    text = " ".join(str(error).split()) or "it is cut off or damaged"
-    return f"{path}: cannot be read ({text}): copy it anew, or remove it: a frame may be missing"
+    text = " ".join(str(error).split()) or "truncated or damaged"
+    return f"{path}: cannot be read ({text}): copy it again, or remove it (a frame may be missing)"
 
 
 def _exr(path: Path, sensor: Sensor) -> Picture:
@@ -189,11 +189,12 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
     except ValueError as error:
         raise PictureError(_broken(path, error)) from error
     if not np.isfinite(image).all():
-        raise PictureError(f"{path}: has pixels that are not finite numbers")
+        raise PictureError(f"{path}: has pixels that are not finite")
     white, black = sensor.white or 1.0, sensor.black or 0.0
     if not black < white:
         raise PictureError(
-            f"{path}: black {black:g} must be below white {white:g}: give `white` in its numbers"
+            f"{path}: black {black:g} must be below white {white:g}: give `white` in the "
+            "file's values"
         )
     full = sensor.white or float(attributes.get("fullScale", np.inf))
     saturated = np.asarray((image >= full * (1 - 1e-5)).any(axis=-1))
@@ -204,7 +205,7 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
 
 
 def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
-    """A picture of whole numbers `(H, W, C)`, or of floats in a TIFF."""
+    """An image of integers `(H, W, C)`, or of floats in a TIFF."""
     whole = np.issubdtype(values.dtype, np.integer)
     white = sensor.white or (float(np.iinfo(values.dtype).max) if whole else 1.0)
     black = sensor.black or 0.0
@@ -213,11 +214,13 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
     colours = values.shape[-1]
     if sensor.bayer is not None:
         if colours != 1:
-            raise PictureError(f"{path}: a mosaic ({sensor.bayer}) has one channel, not {colours}")
+            raise PictureError(
+                f"{path}: expected one channel for a mosaic ({sensor.bayer}), got {colours}"
+            )
         return _mosaic(values[..., 0], sensor.bayer, black, white)
     numbers = np.repeat(values[..., :1], 3, axis=-1) if colours < 3 else values[..., :3]
     if not np.isfinite(numbers).all():
-        raise PictureError(f"{path}: has pixels that are not finite numbers")
+        raise PictureError(f"{path}: has pixels that are not finite")
     share = (numbers.astype(np.float32) - np.float32(black)) / np.float32(white - black)
     full = np.float32(FULL if whole or sensor.white else np.inf)
     saturated = np.asarray((share >= full).any(axis=-1))
@@ -242,7 +245,7 @@ def _raw(path: Path, sensor: Sensor) -> Picture:
     if pattern is not None and pattern.shape == (2, 2) and values.ndim == 2:
         bayer = "".join(colours[i] for i in pattern.ravel())
     if bayer not in MOSAICS:
-        raise PictureError(f"{path}: no Bayer mosaic: develop it to a linear 16-bit TIFF")
+        raise PictureError(f"{path}: not a Bayer mosaic: develop it to a linear 16-bit TIFF")
     black = float(np.mean(blacks)) if sensor.black is None else sensor.black
     white = sensor.white or white
     if not black < white:
@@ -251,18 +254,18 @@ def _raw(path: Path, sensor: Sensor) -> Picture:
 
 
 def _mosaic(values: NDArray[Any], bayer: str, black: float, white: float) -> Picture:
-    """Linear light of a mosaic `(H, W)`, interpolated along edges; saturated is what drew on it."""
+    """Linear light of a mosaic `(H, W)`, interpolated along edges, and pixels it saturates."""
     full = black + FULL * (white - black)
     saturated = cv2.dilate((values >= full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     deep = values.astype(np.uint16)
-    shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # finer than one count between them
+    shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # precision below one count
     image = cv2.demosaicing(deep << shift, MOSAICS[bayer]).astype(np.float32) / (1 << shift)
     light = (image - np.float32(black)) / np.float32(white - black)
     return Picture(light, saturated, FULL, 1 / (white - black))
 
 
 def _decoded(share: Any, response: Literal["linear", "srgb"] | float) -> Any:
-    """Linear light of values that are 1 at white (IEC 61966-2-1 for sRGB); odd below 0."""
+    """Linear light of values with white at 1 (IEC 61966-2-1 for sRGB); odd below 0."""
     if response == "linear" or response == 1.0:
         return share
     value = np.abs(share)

@@ -1,4 +1,4 @@
-"""Files of points: what a digitiser or a scanner writes."""
+"""Point files of digitisers and scanners."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ _ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_points(path: str | Path) -> tuple[Array, Array | None]:
-    """Points `(N, 3)` of a file, and their unit normals `(N, 3)` where it has one for each.
+    """Points `(N, 3)` of a file, and unit normals `(N, 3)` if it has one for each.
 
-    `.obj` and `.ply`: the vertices, faces are ignored. `.csv`: x, y, z and perhaps a normal a line,
-    between commas, semicolons or blanks, after perhaps one line of names; beside semicolons a comma
-    is a decimal one. `.npy`: `(N, 3)` or `(N, 6)`. Raises `ValueError` naming the file and what is
-    wrong.
+    `.obj` and `.ply`: vertices. `.csv`: x, y, z and an optional normal per line, separated by
+    commas, semicolons or blanks, with an optional header; with semicolons, commas are decimal.
+    `.npy`: `(N, 3)` or `(N, 6)`. Raises `ValueError` naming the file and the error.
     """
     path = Path(path)
     readers: dict[str, Callable[[Path], Any]]
@@ -60,12 +59,12 @@ def _obj(path: Path) -> Array:
 
 def _csv(path: Path) -> Array:
     rows: list[list[float]] = []
-    text = path.read_text(encoding="utf-8-sig")  # as spreadsheets write it
-    for number, line in enumerate(text.splitlines(), 1):
-        said = line.partition("#")[0]
-        if ";" in said:  # where numbers have a decimal comma
-            said = said.replace(",", ".")
-        words = [w for w in re.split(r"[,;\s]+", said.strip()) if w]
+    content = path.read_text(encoding="utf-8-sig")  # byte order mark of spreadsheets
+    for number, line in enumerate(content.splitlines(), 1):
+        text = line.partition("#")[0]
+        if ";" in text:  # decimal commas
+            text = text.replace(",", ".")
+        words = [w for w in re.split(r"[,;\s]+", text.strip()) if w]
         if not words:
             continue
         try:
@@ -75,12 +74,12 @@ def _csv(path: Path) -> Array:
                 raise ValueError(f"line {number}: expected numbers, got {line!r}") from None
             continue
         if len(rows[-1]) != len(rows[0]):
-            raise ValueError(f"line {number}: {len(rows[-1])} numbers, {len(rows[0])} before")
+            raise ValueError(f"line {number}: {len(rows[-1])} numbers, expected {len(rows[0])}")
     return np.array(rows, np.float64)
 
 
 def _ply(path: Path) -> Array:
-    """The vertices of a PLY, which must be its first element."""
+    """The vertices of a PLY; they must be its first element."""
     data = path.read_bytes()
     head, end, body = data.partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii").splitlines()]
@@ -97,7 +96,7 @@ def _ply(path: Path) -> Array:
     stop = elements[1] if len(elements) > 1 else len(lines)
     properties = [line[1:] for line in lines[elements[0] : stop] if line[:1] == ["property"]]
     if any(p[0] not in _KIND_OF for p in properties):
-        raise ValueError("a vertex has a property that is not a plain number")
+        raise ValueError("a vertex has a property that is not a number")
     order = _ORDERS[form]
     names = [p[-1] for p in properties]
     wanted = ["x", "y", "z"]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruction.arrays import Array, Bools
-from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import (

@@ -1,4 +1,4 @@
-"""The head of a capture that has none: a template laid under digitised or reconstructed points."""
+"""The head of a capture without a mesh: a template fitted to digitised or reconstructed points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Ints
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.containment import inside
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj
@@ -30,20 +31,20 @@ from reconstruction.masks import MaskedCapture
 from reconstruction.report.report import Stage
 from reconstruction.tangents.reflection import surface_normals
 
-FEWEST_SKIN = 300  # cells with a point of skin under which a head is not guessed from them
+FEWEST_SKIN = 300  # cells with a skin point needed to fit a head
 _CELL = 3e-3
 _INSIDE = 4e-3
 _AMBIGUOUS = 0.2
-_HAIR = 0.015  # metres of hair over the scalp, roughly
+_HAIR = 0.015  # metres: approximate thickness of the hair on the scalp
 _CROWN, _HEIGHT, _RADIUS = 0.12, 0.22, 0.14
-"""Metres: a crown that shows where the head is; from hair to mouth or chin; half a head's depth."""
+"""Metres: height of the crown, from the hair to mouth or chin, and half a head's depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeadPoints:
-    """Points `(N, 3)` of a head, metres, outward unit `normals (N, 3)` where known.
+    """Points `(N, 3)` of a head, metres, with outward unit `normals (N, 3)` if known.
 
-    `source` says who gave them, `hints` what else is known of them.
+    `source` names their origin for messages, `hints` is prior knowledge.
     """
 
     points: Array
@@ -54,19 +55,16 @@ class HeadPoints:
 
 @dataclass(frozen=True, eq=False)
 class FittedHead:
-    """A head under points, and the flat map of its scalp, which it has from its template.
-
-    None where the template's scalp cannot be laid flat.
-    """
+    """A fitted head, and the scalp map of its template, None if that map folds."""
 
     mesh: Mesh
     scalp_map: ScalpMap | None
 
 
 def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | None:
-    """The scalp points of the user's file, or else of `scalp.obj` in the capture, or else None.
+    """The scalp points in the user's file, else in the capture's `scalp.obj`, else None.
 
-    Raises `ValueError` naming the file where it cannot be read.
+    Raises `ValueError` naming a file that cannot be read.
     """
     file = Path(path) if path is not None else inside(capture.path, "scalp.obj")
     if path is None and not file.is_file():
@@ -76,28 +74,27 @@ def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | 
 
 
 def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
-    """Reconstructed points that the mask of the camera that saw them calls skin.
+    """Triangulated points that are skin in the mask of their camera.
 
-    Points with a neighbour that some mask calls hair within a cell's size are left out: a fringe's
-    edge is no skin. So is what lies too low or too far out to be the face of the head that the
-    highest points are of: neck and shoulders. The head is taken to face the side of the bare skin,
-    and to lie some way under the hair of its crown: skin alone leaves its size open. Raises
-    `CaptureError` where too few are left to fit a head to.
+    Points within `_CELL` of a hair point are excluded, and so are points too low or too far out for
+    the face (neck, shoulders). The head is assumed to face the side of the bare skin; points
+    `_HAIR` under the hair of the crown constrain its size. Raises `CaptureError` if too few points
+    remain.
     """
     capture, masks = masked.capture, masked.masks
     if not len(cloud):
         raise CaptureError(
-            f"{capture.path}: no head.obj, and no sweep to find a head by: give head.obj or "
-            "scalp.obj, or take the method auto, which looks for a face under single lights"
+            f"{capture.path}: neither head.obj nor a sweep to fit a head to: provide head.obj or "
+            "scalp.obj, or use the method auto, which fits a head to the face under single lights"
         )
     skin, hair = np.zeros((2, len(cloud)), bool)
     for index, name in enumerate(cloud.cameras):
         if name not in masks:
             continue
         mine = np.flatnonzero(cloud.camera == index)
-        seen, x, y, _ = capture.rig.camera(name).pixels_of(cloud.points[mine])
-        skin[mine[seen]] = masks[name].skin[y[seen], x[seen]]
-        hair[mine[seen]] = masks[name].hair[y[seen], x[seen]]
+        inside, x, y, _ = capture.rig.camera(name).pixels_of(cloud.points[mine])
+        skin[mine[inside]] = masks[name].skin[y[inside], x[inside]]
+        hair[mine[inside]] = masks[name].hair[y[inside], x[inside]]
     if skin.any() and hair.any():
         near = cKDTree(cloud.points[hair]).query(cloud.points[skin])[0] < _CELL
         skin[np.flatnonzero(skin)[near]] = False
@@ -107,10 +104,9 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     points, normals = _thinned(cloud.points[skin], facing)
     if len(points) < FEWEST_SKIN:
         raise CaptureError(
-            f"{capture.path}: no head.obj, and only {len(points)} cells of {_CELL * 1e3:g} mm hold "
-            f"triangulated points of bare skin, at least {FEWEST_SKIN} are needed to fit a head: "
-            "strands need a scalp to be rooted on; give head.obj, or digitised scalp points as "
-            "scalp.obj in the capture or by the option scalp_points"
+            f"{capture.path}: no head.obj, and bare skin was triangulated in only {len(points)} "
+            f"cells of {_CELL * 1e3:g} mm, expected {FEWEST_SKIN} or more to fit a head: provide "
+            "head.obj, or digitised scalp points as scalp.obj or by the option scalp_points"
         )
     x, y = points[:, :2].mean(axis=0) - middle
     turn = float(np.arctan2(x, -y))
@@ -121,10 +117,10 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
 
 
 def lit_skin_points(masked: MaskedCapture, hull: VoxelGrid) -> HeadPoints:
-    """Points on the bare skin of a face, whose shape single lights tell: see `lit_skin`.
+    """Points on the bare skin of a face by photometric stereo (`lit_skin`).
 
-    Of the camera that shows most of it. `hull` is the subject's; the head lies some way under the
-    crown's hair, as in `skin_points`. Raises `CaptureError` where no camera shows enough.
+    From the camera with most skin. `hull` is the subject's; the crown constrains the head as in
+    `skin_points`. Raises `CaptureError` if no camera shows enough skin.
     """
     capture, cameras = masked.capture, masked.cameras
     lowest = float(np.percentile(hull.centers()[:, 2], 99.5)) - _HEIGHT
@@ -133,7 +129,7 @@ def lit_skin_points(masked: MaskedCapture, hull: VoxelGrid) -> HeadPoints:
     faces = [f for f in found if f is not None]
     if not faces:
         raise CaptureError(
-            f"{capture.path}: no camera shows {FEWEST_PIXELS} pixels of skin in one piece under "
+            f"{capture.path}: no camera shows {FEWEST_PIXELS} connected pixels of skin under "
             f"{FEWEST_LIGHTS} single lights"
         )
     face = max(faces, key=lambda f: len(f.points))
@@ -164,11 +160,10 @@ def fit_capture_head(
     cloud: PointCloud | None = None,
     seed: int = 0,
 ) -> FittedHead:
-    """Fit the generic head, or the user's `head_mesh`, under `points`.
+    """Fit the generic head, or the user's `head_mesh` (OBJ, z up), to `points`.
 
-    `head_mesh` is an OBJ with z up and may mark its scalp. Points that leave the turn about z open
-    are taken to be of a head that faces −y, as heads do by convention, with a warning. Of a
-    `cloud`, the share that lies inside the head is reported. Raises `CaptureError`.
+    If the points do not determine the rotation about z, the head is assumed to face −y, with a
+    warning. The share of `cloud` inside the head is reported. Raises `CaptureError`.
     """
     own = None if head_mesh is None else read_obj(head_mesh)
     try:
@@ -183,12 +178,12 @@ def fit_capture_head(
         fit = fitted(points.hints.turn)
         if fit.pose.margin < _AMBIGUOUS:
             stage.warn(
-                "the points fit a head that faces another way nearly as well (its cost is "
-                f"{fit.pose.margin:.0%} higher): it is taken to face −y"
+                "the rotation of the head about z is ambiguous (the cost of another one is "
+                f"{fit.pose.margin:.0%} higher): it is assumed to face −y"
             )
             fit = fitted(0.0)
     except HeadFitError as error:
-        raise CaptureError(f"no head fits the points of {points.source}: {error}") from error
+        raise CaptureError(f"no head could be fitted to {points.source}: {error}") from error
     _report(points, fit, "generic head" if own is None else Path(str(head_mesh)).name, stage)
     if cloud is not None and len(cloud):
         share = float((distance_to(fit.mesh, cloud.points) < -_INSIDE).mean())
@@ -196,11 +191,11 @@ def fit_capture_head(
         if share > 0.1:
             stage.warn(
                 f"{share:.0%} of the triangulated points lie over {_INSIDE * 1e3:g} mm inside the "
-                "fitted head: it is too large or displaced; digitised scalp points would settle it"
+                "fitted head: it is too large or displaced; provide digitised scalp points"
             )
     try:
         return FittedHead(fit.mesh, ScalpMap.of(shape).on(fit.mesh))
-    except ValueError:  # it folds, which is said where the map is written
+    except ValueError:  # it folds; `write_root_map` warns
         return FittedHead(fit.mesh, None)
 
 
@@ -219,9 +214,9 @@ def _report(points: HeadPoints, fit: HeadFit, name: str, stage: Stage) -> None:
 
 
 def _head_region(points: Array) -> tuple[Bools, Array]:
-    """Which of the points `(N, 3)`, hair and all, can be of the head that the highest are of.
+    """Which of the points `(N, 3)` may belong to the head of the highest ones.
 
-    Also its middle `(2,)` on the ground.
+    Also the head's middle `(2,)` in x and y.
     """
     if not len(points):
         return np.zeros(0, bool), np.zeros(2)
@@ -233,10 +228,10 @@ def _head_region(points: Array) -> tuple[Bools, Array]:
 
 
 def _under_the_hair(points: Array, view: Array, most: int) -> tuple[Array, Array] | None:
-    """About where the scalp is `(G, 3)` under the crown's hair, with its normals.
+    """Approximate scalp points `(G, 3)` under the crown's hair, with normals.
 
-    Of `points (N, 3)` on hair that were seen from the directions `view (N, 3)`. No more than
-    `most`: they weigh no more than the skin.
+    From hair points `(N, 3)` with directions `view (N, 3)` to their cameras; at most `most`, so
+    that they weigh no more than the skin.
     """
     if not len(points):
         return None
@@ -250,7 +245,7 @@ def _under_the_hair(points: Array, view: Array, most: int) -> tuple[Array, Array
 
 
 def _thinned(points: Array, normals: Array | None) -> tuple[Array, Array | None]:
-    """One of the points in each cell, so that dense places do not outweigh the others."""
+    """One point per cell, for even weights."""
     first = _one_a_cell(points)
     return points[first], None if normals is None else normals[first]
 

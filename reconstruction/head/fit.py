@@ -1,4 +1,4 @@
-"""A head mesh under points: the generic head, or the user's, posed and then deformed onto them."""
+"""Fit of a head mesh to points: a pose, then a smooth deformation."""
 
 from __future__ import annotations
 
@@ -24,29 +24,27 @@ from reconstruction.head.pose import (
 )
 from reconstruction.head.shape import deform
 
-FEWEST = 10  # points under which no head is fitted: a pose alone has seven unknowns
+FEWEST = 10  # points: a pose has seven unknowns
 
 Part = Literal["head", "above chin", "scalp"]
 _SCALES = (0.7, 1.4)
 _CROWN_TO_CHIN = 0.24
 _INWARD = 0.1
-"""Normals whose mean cosine to the way from the points' middle is under minus this point inwards:
-outward ones of any part of the head 16 cm across have 0.26 or more, 10 cm across -0.01."""
+"""Normals point inwards if their mean cosine to the direction from the points' middle is below
+-0.1: outward normals of any part 16 cm wide have at least 0.26, 10 cm wide -0.01."""
 _UNITS = {10: "decimetres", 39.37: "inches", 100: "centimetres", 1000: "millimetres"}
 
 
 class HeadFitError(ValueError):
-    """Points that no head can be fitted to; the message says why and what to do."""
+    """No head can be fitted; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
 class Distances:
-    """How far points and mesh are apart, in the points' unit.
+    """Distances between points and mesh, in the points' unit: medians, 95th percentiles, RMS.
 
-    `to_mesh_*` from the points that count (no outliers) to the mesh, `to_points_*` from the matched
-    part of the mesh to the nearest point, which is never less than the points' own spacing and
-    large where the points leave the head uncovered. `_median` and `_p95` are quantiles, `_rms` is
-    the root mean square.
+    `to_mesh_*` from the inliers to the mesh, `to_points_*` from the matched part of the mesh to the
+    nearest point, which includes the points' spacing.
     """
 
     to_mesh_rms: float
@@ -58,10 +56,10 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class HeadFit:
-    """The template on the points: posed (`pose`), then deformed (`mesh`, its scalp kept).
+    """The template fitted to points by a `pose` and a deformation (`mesh`, with its scalp).
 
-    `posed` and `deformed` are the distances before and after; `outliers (N,)` the points that did
-    not count in the end; `folded` how many faces turned over against the posed template.
+    `posed` and `deformed` are the distances before and after the deformation; `outliers (N,)` are
+    points not used; `folded` is the number of faces that turned over.
     """
 
     mesh: Mesh
@@ -73,7 +71,7 @@ class HeadFit:
     warnings: tuple[str, ...]
 
     def figures(self) -> dict[str, Any]:
-        """All numbers, JSON-ready."""
+        """Figures of the fit, JSON-ready."""
         deviation = [float(d) if np.isfinite(d) else None for d in self.pose.deviation]
         return {
             "scale": self.pose.scale,
@@ -90,13 +88,12 @@ class HeadFit:
 
 @dataclass(frozen=True, eq=False)
 class HeadHints:
-    """What is known beforehand of points on a head.
+    """Prior knowledge of points on a head.
 
-    They lie on any part of the template, on what is above its chin, or on its scalp alone (`part`),
-    in the template's unit, metres, unless `any_unit`. `landmarks` are places `(L, 3)` on the
-    template and the same places `(L, 3)` among the points, L at least 3; without them all turns
-    about z are tried, or those about `turn` (radians, 0 faces −y). `guides` are further points and
-    normals `(G, 3)` that only roughly lie on the head: they take part in the pose alone.
+    `part` of the template that they lie on; metres unless `any_unit`. `landmarks` are at least
+    three points `(L, 3)` on the template and the same ones `(L, 3)` among the points; without them
+    all rotations about z are tried, or those near `turn` (radians, 0 faces −y). `guides` are points
+    and normals `(G, 3)` roughly on the head, used for the pose only.
     """
 
     part: Part = "head"
@@ -114,10 +111,10 @@ def fit_head(
     *,
     seed: int = 0,
 ) -> HeadFit:
-    """Fit `template` (the generic head where None) to `points (N, 3)`, both with z upwards.
+    """Fit `template` (default: the generic head) to `points (N, 3)`, both with z up.
 
-    `normals (N, 3)` are outward unit ones, where known; up to about two in five of the points may
-    be outliers. Raises `HeadFitError`.
+    `normals (N, 3)` are outward and of unit length, if known; about 40 % of the points may be
+    outliers. Raises `HeadFitError`.
     """
     part, landmarks, any_unit = hints.part, hints.landmarks, hints.any_unit
     template = generic_head() if template is None else template
@@ -149,8 +146,8 @@ def fit_head(
     pose = find_pose(surface, *_with(at, facing, hints.guides), search)
     if not any_unit and not _SCALES[0] < pose.scale < _SCALES[1]:
         raise HeadFitError(
-            f"the head under the points would be {pose.scale:.2f} times the template's size, "
-            f"expected {_SCALES[0]} to {_SCALES[1]}: are the points a head's, in metres?"
+            f"the fitted head has {pose.scale:.2f} times the template's size, expected "
+            f"{_SCALES[0]} to {_SCALES[1]}: check that the points are on a head and in metres"
         )
     posed = Mesh(pose(template.vertices), template.faces, template.scalp)
     mesh = deform(posed, faces, at, facing, size)
@@ -161,11 +158,10 @@ def fit_head(
 
 
 def mark_scalp(mesh: Mesh, *, seed: int = 0) -> tuple[Mesh, HeadFit]:
-    """A head without a marked scalp (any unit, z up) with the generic head's scalp marked on it.
+    """A head mesh (any unit, z up, no body) with the generic head's scalp marked on it.
 
-    The generic head is fitted to the mesh; faces that lie on its scalp and look the same way (the
-    backs of ears do not) are scalp. Cut a whole body off below the neck beforehand. Raises
-    `HeadFitError`.
+    The generic head is fitted to the mesh; faces near its scalp with similar normals (not the backs
+    of ears) are scalp. Raises `HeadFitError`.
     """
     spacing = float(np.ptp(mesh.vertices, axis=0).max()) / 80
     places, normals, _ = surface_samples(mesh, spacing)
@@ -190,7 +186,7 @@ def _faces(template: Mesh, part: str) -> Bools:
     if template.scalp is None or not template.scalp.any():
         raise HeadFitError(
             "the template marks no scalp (a group or material named 'scalp' in its OBJ): "
-            "fit the whole head, or let mark_scalp mark it"
+            "fit the whole head, or mark it with 'hairstage head mark'"
         )
     return template.scalp
 
@@ -207,12 +203,12 @@ def _with(
 
 
 def _spread(points: Array) -> float:
-    """Median distance from the median: a size that outliers hardly change."""
+    """Median distance from the median: a robust size."""
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _ratio(points: Array, normals: Array | None, template: Array) -> float:
-    """How much the points spread against the template's, once they are fit to be used."""
+    """The points' spread relative to the template's; raises `HeadFitError` for invalid points."""
     if len(points) < FEWEST:
         raise HeadFitError(f"{len(points)} points, at least {FEWEST} are needed to fit a head")
     if normals is not None and normals.shape != points.shape:
@@ -224,28 +220,28 @@ def _ratio(points: Array, normals: Array | None, template: Array) -> float:
     out = points - points.mean(axis=0)
     spans = np.linalg.svd(out, compute_uv=False)
     if spans[1] <= 1e-6 * max(spans[0], 1e-12):
-        raise HeadFitError("the points coincide or lie on a line: no head is determined")
+        raise HeadFitError("the points coincide or are collinear: they determine no head")
     if normals is not None and (out * normals).sum() < -_INWARD * np.linalg.norm(out, axis=1).sum():
         raise HeadFitError(
-            "the normals point into the head: turn them round (the faces, of a mesh), or give "
+            "the normals point into the head: reverse them (for a mesh, its faces), or provide "
             "points without normals"
         )
     return _spread(points) / _spread(template)
 
 
 def _require_unit(ratio: float, part: str) -> None:
-    smallest = 0.25 if part == "head" else 0.1  # a patch of scalp may be all there is
+    smallest = 0.25 if part == "head" else 0.1  # may be a patch of scalp
     if smallest < ratio < 4:
         return
     if ratio >= 4:
         factor, unit = min(_UNITS.items(), key=lambda u: abs(np.log(ratio / u[0])))
         raise HeadFitError(
-            f"the points spread {ratio:.3g} times as far as a head in metres does: they look like "
+            f"the points' extent is {ratio:.3g} times that of a head in metres: they seem to be in "
             f"{unit}; multiply them by {1 / factor:.4g}"
         )
     raise HeadFitError(
-        f"the points spread only {ratio:.3g} times as far as a head in metres does: check their "
-        "unit, or whether they are a head's at all"
+        f"the points' extent is only {ratio:.3g} times that of a head in metres: check their unit "
+        "and that they are on a head"
     )
 
 
@@ -264,14 +260,14 @@ def _warnings(pose: Pose, outliers: Bools) -> tuple[str, ...]:
     out = []
     if pose.stiffness[0] < 0.03:
         out.append(
-            f"the points hardly determine the head's pose: {pose.weakest} is the weakest motion, a "
-            f"millimetre along it changes distances by {pose.stiffness[0]:.2g} mm"
+            f"the points hardly determine the head's pose: a millimetre along the weakest motion, "
+            f"{pose.weakest}, changes distances by {pose.stiffness[0]:.2g} mm"
         )
     if pose.margin < 0.2:
         out.append(
-            f"another pose fits nearly as well (its cost is {pose.margin:.0%} higher): give "
+            f"another pose fits nearly as well (its cost is {pose.margin:.0%} higher): provide "
             "landmarks"
         )
     if outliers.mean() > 0.4:
-        out.append(f"{outliers.mean():.0%} of the points do not lie on the head")
+        out.append(f"{outliers.mean():.0%} of the points are not on the head")
     return tuple(out)

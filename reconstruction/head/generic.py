@@ -1,4 +1,4 @@
-"""The generic head: an implicit surface of blended ellipsoids, meshed once, its scalp marked."""
+"""The generic head: blended ellipsoids, meshed once, with a marked scalp."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.signed_distance import blend, capsule, carve, ellipsoid
 
 HEAD_BOX = np.array([[-0.15, -0.19, -0.20], [0.15, 0.19, 0.19]])
-"""Corners `(2, 3)` of a box, metres, that holds the head with room around it."""
+"""Corners `(2, 3)` of a box around the head with margin, metres."""
 
 NECK_END = -0.165  # height, metres, at which the neck is cut flat
-_CELL = 0.005  # mesh cells: ears and lips survive, and a ray tracer is spared needless triangles
+_CELL = 0.005  # metres: resolves ears and lips
 # Height of the hairline over the front-back coordinate: forehead, temple, sideburn, ear, nape.
 _HAIRLINE = PchipInterpolator(
     [-0.100, -0.080, -0.050, -0.025, -0.010, 0.010, 0.035, 0.050, 0.075, 0.110],

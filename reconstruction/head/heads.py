@@ -1,10 +1,11 @@
-"""Which head strands grow from: the user's, the capture's, or a template under what shows."""
+"""The head that strands grow from: the user's, the capture's, or a fitted template."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.head.capture_head import (
     FittedHead,
     HeadPoints,
@@ -20,12 +21,12 @@ from reconstruction.model import Model
 from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.report import Progress, Report
 
-UNLIKE_MM = 3.0  # RMS from a face's points to the posed template's: of another head it has 5
+UNLIKE_MM = 3.0  # RMS of a face's points from the posed template; another head has 5
 
 
 @dataclass(frozen=True)
 class Heads:
-    """The ways to a head; each leaves it in `model`, and the stage `head` in the report."""
+    """Sources of a head; each writes it to `model` and the stage `head` to the report."""
 
     model: Model
     options: ReconstructOptions
@@ -33,25 +34,25 @@ class Heads:
     report: Report
 
     def known(self, capture: Capture) -> FittedHead | None:
-        """The head under the user's scalp points, which win where asked for, or the capture's."""
+        """The capture's head, unless `scalp_points` is given, else one fitted to scalp points."""
         self.report.drop("head")
-        asked = self.options.scalp_points
-        if capture.head is not None and asked is None:
+        file = self.options.scalp_points
+        if capture.head is not None and file is None:
             return FittedHead(capture.head, None)
-        points = digitised_points(capture, asked)
+        points = digitised_points(capture, file)
         return None if points is None else self._fitted(points)
 
-    def under_skin(self, masked: MaskedCapture, cloud: PointCloud) -> FittedHead:
-        """The head under the triangulated points on bare skin."""
+    def fit_to_skin_points(self, masked: MaskedCapture, cloud: PointCloud) -> FittedHead:
+        """The head fitted to triangulated points on bare skin."""
         return self._fitted(skin_points(masked, cloud), cloud)
 
-    def by_light(self, masked: MaskedCapture) -> FittedHead | None:
-        """The head under skin whose shape single lights show, None where they show none."""
+    def fit_by_shading(self, masked: MaskedCapture) -> FittedHead | None:
+        """The head fitted to skin by photometric stereo, None if that fails."""
         lights = masked.capture.olat_lights()
         if len(lights) < FEWEST_LIGHTS or not any(m.skin.any() for m in masked.masks.values()):
             return None
         with self.report.stage("head") as stage:
-            self.progress("looking for a face", 0.0)
+            self.progress("fitting a head to the face", 0.0)
             try:
                 points = lit_skin_points(masked, masked.subject_hull(self.options.grid))
                 seed = self.options.seed
@@ -59,16 +60,16 @@ class Heads:
                 off = stage.figures["posed_rms_mm"]
                 if off > UNLIKE_MM:
                     raise CaptureError(
-                        f"the face is {off:.1f} mm off the template's, more than {UNLIKE_MM:g}"
+                        f"the face is {off:.1f} mm RMS from the template, limit {UNLIKE_MM:g} mm"
                     )
             except CaptureError as error:
                 stage.warn(
-                    f"no head is taken from single lights, no strand has a root: {error}: give "
-                    "head.obj, or scalp points as scalp.obj"
+                    f"no head could be fitted, strands have no roots: {error}; provide head.obj, "
+                    "or scalp points as scalp.obj"
                 )
                 self.model.remove("head.obj")
                 return None
-            self.progress(f"head: a template under {points.source}", 0.0)
+            self.progress(f"head: template fitted to {points.source}", 0.0)
             self.model.write_head(head.mesh)
         return head
 

@@ -1,8 +1,7 @@
-"""The face that single lights show, where no sweep measures it and nobody digitised the head.
+"""The shape of a face by photometric stereo under single lights (Woodham 1980).
 
-Skin is nearly matte: what a pixel answers to lights at known places tells its normal (Woodham
-1980), and that of a whole face its shape, but for how far off it is. That is told by the visual
-hull: no skin lies before it, and where the face makes the outline it is touched.
+Skin is nearly matte: radiance under lights at known positions gives normals, and these the depth
+up to scale. The visual hull fixes the scale: skin lies behind its surface and touches it.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.grey import grey
 
 FEWEST_LIGHTS, MOST_LIGHTS = 24, 110
-"""Lights under which a pixel's normal is not trusted, and those that are read at most, about."""
+"""Least number of lights for a normal, and about the most that are read."""
 FEWEST_PIXELS = 300
 
-_ROUNDS = 4  # of normals, and of where the lights are seen from
-_SHADED, _SHINING = 0.5, 1.5  # shares of the matte answer outside which a light does not count
-_GRAZING = 0.3  # cosine to the ray under which a pixel's slope is not followed
-_BENT = 0.85  # cosine between neighbours' normals under which one may hide what is behind it
-_TOUCHING = 0.97  # the share of the skin that lies behind the hull's surface, or on it
+_ROUNDS = 4  # of normals and depths: light directions depend on depth
+_SHADED, _SHINING = 0.5, 1.5  # of the matte radiance: lights outside this range are skipped
+_GRAZING = 0.3  # least cosine to the ray of an integrated pixel
+_BENT = 0.85  # least cosine between neighbouring normals; below, there may be an edge
+_TOUCHING = 0.97  # share of the skin on or behind the hull's surface
 
 
 @dataclass(frozen=True, eq=False)
 class LitSkin:
-    """Points `(N, 3)` of skin that a `camera` sees, and outward unit `normals (N, 3)`."""
+    """Skin points `(N, 3)` visible in a `camera`, and outward unit `normals (N, 3)`."""
 
     points: Array
     normals: Array
@@ -43,11 +42,11 @@ class LitSkin:
 def lit_skin(
     capture: Capture, camera: Camera, skin: Bools, hull: VoxelGrid, lowest: float = -np.inf
 ) -> LitSkin | None:
-    """The largest piece of `skin (H, W)` of a camera, above the height `lowest`, metres.
+    """The largest connected part of `skin (H, W)` of a camera, above the height `lowest`, metres.
 
-    Its pixels are averaged until they are as wide as the voxels of the subject's `hull`. None
-    where fewer than `FEWEST_LIGHTS` that reach the head were shot or fewer than `FEWEST_PIXELS`
-    hang together. On rendered faces the shape is within 1 to 2 mm, and within 3 mm of where it is.
+    Pixels are averaged to the size of the voxels of the subject's `hull`. None with fewer than
+    `FEWEST_LIGHTS` lights that reach the head or `FEWEST_PIXELS` connected pixels. On rendered
+    faces the shape is accurate to 1 to 2 mm, the position to 3 mm.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera.name)]
     names = [n for n in names if capture.rig.light(n).intensity_towards(np.zeros(3)).any()]
@@ -86,11 +85,11 @@ def lit_skin(
 
 
 def matte_normals(values: AnyFloats, to_light: Array, known: Bools | None = None) -> Array:
-    """Unit normals `(N, 3)` of matte pixels that answer `values (N, L)` to lights.
+    """Unit normals `(N, 3)` of matte pixels with `values (N, L)` under L lights.
 
-    `to_light (N, L, 3)` leads from each pixel to each light, metres; light falls off with its
-    square. Answers are left out that are not `known (N, L)`, less than half of the matte one, as
-    in a shadow, or half as much again, as a highlight. 0 where no light is left.
+    `to_light (N, L, 3)` is the vector from each pixel to each light, metres; irradiance falls with
+    its square. Excluded are values not `known (N, L)`, and values outside `_SHADED` to `_SHINING`
+    of the matte radiance. 0 if no light remains.
     """
     square = (to_light**2).sum(axis=2)
     ahead = to_light / np.sqrt(square)[..., None]
@@ -107,10 +106,10 @@ def matte_normals(values: AnyFloats, to_light: Array, known: Bools | None = None
 
 
 def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Array]:
-    """Log depths `(N,)` of the pixels of `region (H, W)`, each piece's but for a constant.
+    """Log depths `(N,)` of the pixels of `region (H, W)`, up to a constant per part.
 
-    By least squares from `normals (N, 3)` in the world. Also the number of the piece `(N,)`: where
-    the surface is seen at a grazing angle, or turns sharply, there may be an edge.
+    Least-squares integration of world `normals (N, 3)`. Also the index of the part `(N,)`: parts
+    are separated at grazing angles and sharp bends, where there may be an edge.
     """
     y, x = np.nonzero(region)
     number = np.full(region.shape, -1)
@@ -119,7 +118,7 @@ def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Ar
     rays = camera.rays(np.stack([x, y], axis=1)) @ camera.R.T
     rays /= rays[:, 2:]
     facing = -(n * rays).sum(axis=1)
-    slope = n[:, :2] @ np.linalg.inv(camera.K[:2, :2]) / np.maximum(facing, 0.1)[:, None]
+    gradient = n[:, :2] @ np.linalg.inv(camera.K[:2, :2]) / np.maximum(facing, 0.1)[:, None]
     follows = facing > _GRAZING
     rows, columns, entries, wanted = [], [], [], []
     count = 0
@@ -135,7 +134,7 @@ def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Ar
         rows += [row, row]
         columns += [a, b]
         entries += [-weight, weight]
-        wanted.append(weight * 0.5 * (slope[a, axis] + slope[b, axis]))
+        wanted.append(weight * 0.5 * (gradient[a, axis] + gradient[b, axis]))
     where = np.concatenate(rows), np.concatenate(columns)
     system = sparse.csr_array((np.concatenate(entries), where), shape=(count, len(y)))
     normal = (system.T @ system + 1e-9 * sparse.eye_array(len(y))).tocsc()
@@ -144,22 +143,22 @@ def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Ar
 
 
 def first_depth(camera: Camera, hull: VoxelGrid) -> Array:
-    """Depth `(H, W)` of the hull's nearest voxel along z, metres, infinite where there is none.
+    """Depth `(H, W)` of the hull's nearest voxel along z, metres, infinite without one.
 
-    In squares of pixels as wide as a voxel: finer pixels miss the voxels' centres.
+    In squares of pixels as wide as a voxel, since finer pixels miss voxel centres.
     """
     centers = hull.centers()
-    seen, x, y, depth = camera.pixels_of(centers)
+    inside, x, y, depth = camera.pixels_of(centers)
     size = hull.spacing * camera.K[0, 0] / float(np.median(depth)) if len(depth) else 1.0
     square = max(1, int(np.ceil(size)))
     first = np.full((camera.height // square + 1, camera.width // square + 1), np.inf)
-    np.minimum.at(first, (y[seen] // square, x[seen] // square), depth[seen])
+    np.minimum.at(first, (y[inside] // square, x[inside] // square), depth[inside])
     rows, columns = (np.arange(n) // square for n in (camera.height, camera.width))
     return np.asarray(first[np.ix_(rows, columns)])
 
 
 def _points(camera: Camera, depth: Array) -> Array:
-    """Where in the world `depth (H, W)` along z is, `(H, W, 3)`."""
+    """World positions `(H, W, 3)` at `depth (H, W)` along z."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     rays = camera.rays(grid)
     return np.asarray(camera.center + rays * (depth / (rays @ camera.R[2]))[..., None])
@@ -173,13 +172,13 @@ def _image(region: Bools, values: Array) -> Array:
 
 
 def _blocks(image: AnyFloats | Bools, by: int) -> Array:
-    """An image `(H, W)` in blocks `(h, by, w, by)`, what fills none cut off."""
+    """An image `(H, W)` in blocks `(h, by, w, by)`, cropped to full blocks."""
     height, width = (n // by for n in image.shape)
     return np.asarray(image[: height * by, : width * by].reshape(height, by, width, by))
 
 
 def _largest(mask: Bools) -> Bools:
-    """The largest piece of a mask that hangs together."""
+    """The largest connected part of a mask."""
     label, count = ndimage.label(mask)
     if not count:
         return mask

@@ -1,4 +1,4 @@
-"""Where a head is and how large: a similarity between a mesh and points, by robust ICP.
+"""The pose of a head: a similarity between a mesh and points, by robust ICP.
 
 Point to plane, closest points by KD-tree, Tukey's weights on the distances. (Chen and Medioni 1992;
 Zinßer, Schmidt, Niemann 2005 for the scale.)
@@ -17,7 +17,7 @@ from skimage.transform import SimilarityTransform
 from reconstruction.arrays import Array, Ints
 
 MOTIONS = ("turn x", "turn y", "turn z", "scale", "shift x", "shift y", "shift z")
-"""The seven ways in which a similarity can change, in the order of every `(7,)` here."""
+"""The motions of a similarity, in the order of every `(7,)` here."""
 
 _YAWS = 12
 _COARSE = 300
@@ -37,7 +37,7 @@ class SurfaceSamples:
         object.__setattr__(self, "_tree", cKDTree(self.points))
 
     def nearest(self, points: Array, limit: float) -> tuple[Array, Ints]:
-        """Distances `(N,)`, never over `limit`, and samples `(N,)`: any beyond that, it is slow."""
+        """Distances `(N,)` up to `limit`, and sample indices `(N,)`, arbitrary beyond it."""
         distance, index = self._tree.query(points, distance_upper_bound=limit)
         return np.minimum(distance, limit), np.where(np.isfinite(distance), index, 0)
 
@@ -46,11 +46,10 @@ class SurfaceSamples:
 class Pose:
     """`x -> scale * rotation @ x + translation` from the mesh's frame to the points'.
 
-    `deviation (7,)` are standard deviations of `MOTIONS`: radians, share, metres; they count every
-    point as independent. `stiffness (7,)` are sorted, smallest first: how far distances change, at
-    root mean square, per metre that the samples move along each principal motion; `weakest` says
-    which motion the first is. `margin` is the share by which the cost of the next best start that
-    ended elsewhere exceeds this one's (infinite where all starts ended here).
+    `deviation (7,)` are standard deviations of `MOTIONS` (radians, share, metres), for independent
+    points. `stiffness (7,)`, ascending, is the RMS change of distances per metre of motion along
+    each principal motion; `weakest` names the first. `margin` is the relative excess cost of the
+    next best pose (infinite if all starts converge to this one).
     """
 
     scale: float
@@ -76,15 +75,15 @@ class Pose:
 
 
 def tukey(distance: Array, least: float) -> Array:
-    """Weights `(N,)`, 0 to 1, that fall to 0 at three robust deviations (or `least`)."""
+    """Tukey weights `(N,)`, 0 beyond three robust deviations (at least `least`)."""
     cut = max(3 * 1.4826 * float(np.median(distance)), least)
     return np.maximum(1 - (distance / cut) ** 2, 0) ** 2
 
 
 def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation and translation that take `source (N, 3)` onto `target (N, 3)` best.
+    """Least-squares scale, rotation and translation from `source (N, 3)` to `target (N, 3)`.
 
-    Least squares (Umeyama 1991). Raises `ValueError` for under three points or points on a line.
+    Umeyama 1991. Raises `ValueError` for under three points or collinear points.
     """
     if source.shape != target.shape or len(source) < 3:
         raise ValueError(
@@ -93,7 +92,7 @@ def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
     for side in (source, target):
         spans = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
         if spans[1] < 1e-3 * spans[0]:
-            raise ValueError("the landmarks lie on a line: their rotation is undetermined")
+            raise ValueError("the landmarks are collinear: they determine no rotation")
     found = SimilarityTransform.from_estimate(source, target)
     scale = float(found.scale)
     return scale, found.params[:3, :3] / scale, np.asarray(found.translation)
@@ -101,13 +100,12 @@ def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class PoseSearch:
-    """Where a pose is searched.
+    """Starts of a pose search.
 
-    Without a `start` (scale, rotation `(3, 3)`, translation `(3,)`), twelve turns about z (or
-    `turn`, radians, and thirty degrees to either side) at each of `scales` are tried on a few
-    hundred points, the tops of both at one height. `scale_deviation` is what is known of the scale
-    beforehand, a standard deviation of its logarithm about the middle of `scales`, or None. `size`
-    is the head's radius in the points' unit, which distances are judged by.
+    Without a `start` (scale, rotation `(3, 3)`, translation `(3,)`), twelve rotations about z (or
+    `turn`, radians, and 30° to either side) at each of `scales` are tried on `_COARSE` points, with
+    tops aligned. `scale_deviation` is the prior standard deviation of the log scale about the
+    middle of `scales`, or None. `size` is the head's radius in the points' unit.
     """
 
     start: tuple[float, Array, Array] | None = None
@@ -124,9 +122,9 @@ def find_pose(
     normals: Array | None = None,
     search: PoseSearch = PoseSearch(),
 ) -> Pose:
-    """The pose in which `surface` lies on `points (N, 3)`, both with z about upwards.
+    """The pose of `surface` on `points (N, 3)`, both roughly with z up.
 
-    `normals (N, 3)` are unit, outward.
+    `normals (N, 3)` are outward and of unit length.
     """
     if search.start is not None:
         return _refine(surface, (points, normals), search.start, search, 60)
@@ -171,7 +169,7 @@ def _margin(
     normals: Array | None,
     size: float,
 ) -> float:
-    """By what share the points that lie on the best pose cost more in the next best one."""
+    """Relative excess cost of the next best pose, over the inliers of the best."""
     if not others:
         return np.inf
     distance = best.scale * surface.nearest(best.inverse(points), 0.5 * size / best.scale)[0]
@@ -189,7 +187,7 @@ def _apart(a: Pose, b: Pose) -> float:
 def _cost(
     surface: SurfaceSamples, pose: Pose, points: Array, normals: Array | None, size: float
 ) -> float:
-    """Mean squared distance, cut off at an eighth of the head's radius, in units of that."""
+    """Mean squared distance, clipped at and in units of an eighth of the head's radius."""
     cut = 0.125 * size / pose.scale
     distance, index = surface.nearest(pose.inverse(points), cut)
     far = distance / cut
@@ -220,7 +218,7 @@ def _refine(
         total = max(float(weight.sum()), 1e-9)
         center = weight @ x / total
         q = x - center
-        # every motion in units of length, so that they can be compared: radius times angle or share
+        # all motions in units of length: radius times angle or share
         radius = max(float(np.sqrt(weight @ (q**2).sum(axis=1) / total)), 1e-9)
         J = np.hstack([np.cross(q, n) / radius, (q * n).sum(axis=1)[:, None] / radius, n])
         r = (n * (points - x)).sum(axis=1)
@@ -232,7 +230,7 @@ def _refine(
             normal[3, 3] += strength
             right[3] += strength * radius * np.log(middle / scale)
         values, vectors = np.linalg.eigh(normal)
-        free = values > 1e-4 * values[-1]  # what nothing determines is left where it is
+        free = values > 1e-4 * values[-1]  # undetermined motions stay fixed
         step = vectors[:, free] @ (vectors[:, free].T @ right / values[free])
         step[:4] = np.clip(step[:4] / radius, -0.2, 0.2)
         turn, grow = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[3]))

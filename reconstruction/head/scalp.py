@@ -1,4 +1,4 @@
-"""Where hair grows from: the marked scalp, or what the captures say is under hair."""
+"""The scalp: marked in the mesh, or inferred from the hair's envelope."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.voxels import VoxelGrid
 
 _LIFTS = np.arange(1, 7) * 2e-3
-"""Metres above the skin at which hair is looked for: the envelope may stay clear of the head."""
+"""Metres above the skin that are tested for hair: the envelope may not touch the head."""
 
 
 class NoScalp(ValueError):
-    """A head on which no scalp can be told."""
+    """No scalp is marked and none can be inferred."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scalp:
     """The part of a head that hair grows from.
 
-    `points (M, 3)` lie evenly on it with outward `normals (M, 3)`; `marked` says that the mesh
-    itself marks its scalp, else it was inferred from the hair's envelope. `share (F,)` is the part
-    of each face that belongs to it.
+    `points (M, 3)` sample it evenly, with outward `normals (M, 3)`; `marked` by the mesh, else
+    inferred from the hair's envelope. `share (F,)` is the part of each face that belongs to it.
     """
 
     head: Mesh
@@ -44,25 +43,24 @@ class Scalp:
 def find_scalp(head: Mesh, hair: VoxelGrid | None = None, spacing: float = 2e-3) -> Scalp:
     """The scalp of a head, from its mark, or else from the `hair` envelope around it.
 
-    Unmarked, a piece of the surface is scalp where the envelope lies on it and it is not below the
-    hairline of a head of this size: hair also hangs over neck, ears and shoulders without growing
-    there. That line sinks from 0.9 half-widths of the head below its top at the face, which is
-    where most bare skin is, to 2.2 half-widths at the nape.
+    Inferred scalp is surface under the envelope and above the hairline, since hair also covers
+    neck, ears and shoulders. The hairline falls from 0.9 half-widths of the head below its top at
+    the face (the side with most bare skin) to 2.2 half-widths at the nape.
 
-    Raises `NoScalp` where nothing is left.
+    Raises `NoScalp`.
     """
     points, normals, faces = surface_samples(head, spacing)
     if head.scalp is not None:
         keep = head.scalp[faces]
     elif hair is None:
-        raise NoScalp("the head marks no scalp (a group named 'scalp' in its OBJ) and no hair lies")
+        raise NoScalp("the head marks no scalp (a group named 'scalp' in its OBJ)")
     else:
         keep = _under_hair(points, normals, hair)
         keep &= _above_hairline(points, keep)
     if not keep.any():
         raise NoScalp(
-            "no part of the head is under hair: check that head.obj and the cameras share a frame, "
-            "or mark the scalp as a group named 'scalp' in the OBJ"
+            "no part of the head is under hair: check that head.obj and the cameras are in one "
+            "frame, or mark the scalp as a group named 'scalp' in the OBJ"
         )
     total = np.bincount(faces, minlength=len(head.faces))
     share = np.bincount(faces, keep, len(head.faces)) / np.maximum(total, 1)
@@ -91,8 +89,8 @@ def _above_hairline(points: Array, covered: Bools) -> Bools:
 def sample_roots(scalp: Scalp, count: int, seed: int) -> tuple[Array, Array]:
     """`count` roots `(N, 3)` uniform over the scalp's area, and their normals `(N, 3)`.
 
-    Faces are drawn by their scalp area; on faces that are only partly scalp, roots are redrawn
-    until they fall near a scalp point.
+    Faces are drawn by their scalp area; on partial scalp faces, roots are redrawn until near a
+    scalp point.
     """
     if count < 1:
         raise ValueError(f"the number of roots must be positive, got {count}")

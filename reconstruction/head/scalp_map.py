@@ -1,9 +1,8 @@
-"""A flat map of the scalp: roots to (u, v) in the unit square, as appearance volumes need them.
+"""The scalp map: from roots to (u, v) in the unit square, for appearance volumes.
 
-The scalp is seen from the middle of the sphere that fits it best and laid flat by Lambert's
-equal-area projection about its own middle, then stretched to the unit square: u grows to the
-subject's left, v from the forehead to the nape. Heads of one template share the map, vertex by
-vertex.
+Lambert's equal-area projection of the scalp from the centre of its best-fitting sphere, scaled to
+the unit square: u grows to the subject's left, v from the forehead to the nape. Heads of one
+template share the map by vertex.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _SPACING = 2e-2  # of samples for the closest point, as a share of the scalp's e
 
 @dataclass(frozen=True, eq=False)
 class ScalpMap:
-    """`uv (V, 2)` at the vertices of `head` that belong to a scalp face; NaN at the others."""
+    """`uv (V, 2)` at the vertices of scalp faces of `head`; NaN at the others."""
 
     head: Mesh
     uv: Array
@@ -42,10 +41,10 @@ class ScalpMap:
 
     @classmethod
     def of(cls, head: Mesh) -> ScalpMap:
-        """The map of a head in its own frame: z up, face towards -y, its scalp marked.
+        """The map of a head with marked scalp, z up and face towards −y.
 
-        Raises `ValueError` where it is not marked, or where the map would fold: where one ray from
-        the middle meets the scalp twice.
+        Raises `ValueError` without a marked scalp, or if the map folds: if a ray from the centre
+        meets the scalp twice.
         """
         scalp = _scalp(head)
         faces = head.faces[scalp]
@@ -66,18 +65,18 @@ class ScalpMap:
         if folded:
             raise ValueError(
                 f"the map of the scalp folds at {folded} of its {len(faces)} faces: they face the "
-                "middle of the head or hide each other (ears?); leave them out of the marked scalp"
+                "centre of the head or overlap (ears?); remove them from the marked scalp"
             )
         return cls(head, uv)
 
     def on(self, head: Mesh) -> ScalpMap:
-        """The same map on `head`, another shape or pose of the same template."""
+        """The same map on `head`, another shape or pose of the template."""
         if not np.array_equal(head.faces, self.head.faces):
-            raise ValueError("the other head must have the same faces")
+            raise ValueError("both heads must have the same faces")
         return ScalpMap(Mesh(head.vertices, head.faces, self.head.scalp), self.uv)
 
     def __call__(self, points: AnyFloats) -> tuple[Array, Array]:
-        """(u, v) `(N, 2)` at the scalp's closest point to `points (N, 3)`, and its distance."""
+        """(u, v) `(N, 2)` of the scalp points closest to `points (N, 3)`, and the distances."""
         face, weights, distance = self._closest(points)
         uv = np.einsum("nc,ncd->nd", weights, self.uv[self.head.faces[face]])
         return np.clip(uv, 0, 1), distance
@@ -92,12 +91,14 @@ class ScalpMap:
 
 def _scalp(head: Mesh) -> Bools:
     if head.scalp is None or not head.scalp.any():
-        raise ValueError("the head marks no scalp: mark it in the OBJ, or let mark_scalp do so")
+        raise ValueError(
+            "the head marks no scalp: mark it in the OBJ or with 'hairstage head mark'"
+        )
     return head.scalp
 
 
 def sphere_center(points: Array) -> Array:
-    """Centre `(3,)` of the sphere that fits `points (N, 3)` best, by algebraic least squares."""
+    """Centre `(3,)` of the sphere fitted to `points (N, 3)` by algebraic least squares."""
     middle = points.mean(axis=0)
     q = points - middle
     solved, *_ = np.linalg.lstsq(np.c_[2 * q, np.ones(len(q))], (q**2).sum(axis=1), rcond=None)
@@ -105,7 +106,7 @@ def sphere_center(points: Array) -> Array:
 
 
 def _signed_areas(corners: Array) -> Array:
-    """Areas of flat triangles `(F, 3, 2)`, negative where they are turned over."""
+    """Areas of flat triangles `(F, 3, 2)`, negative if reversed."""
     e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.asarray(0.5 * (e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]))
 
@@ -113,13 +114,13 @@ def _signed_areas(corners: Array) -> Array:
 def write_root_map(
     model: Model, strands: Strands, scalp: Scalp, flat: ScalpMap | None, stage: Stage
 ) -> None:
-    """Write `scalp_map.npz` into `model`: the (u, v) of every root, and the map on the scalp.
+    """Write `scalp_map.npz` into `model`: the (u, v) of every root, and the map of the scalp.
 
     roots (S, 2) float32     of each strand, in the order of `strands.npz`
-    uv (V, 2) float32        of the scalp's `vertices (V, 3)`, of which `faces (F, 3)` are made
+    uv (V, 2) float32        at the scalp's `vertices (V, 3)` with `faces (F, 3)`
 
-    `flat` is the map that the head has from its template; without one, the head is taken to be in
-    its own frame (z up, face towards −y). A scalp whose map would fold has none: the stage warns.
+    `flat` is the map of the head's template; without one, the head must have z up and face −y. If
+    the map folds, no file is written and the stage warns.
     """
     if flat is None:
         marked = scalp.head.scalp if scalp.marked else scalp.share >= 0.5

@@ -1,9 +1,8 @@
-"""A head's own shape: a smooth displacement of a posed mesh towards points.
+"""A smooth deformation of a posed head mesh towards points.
 
-The displacement is carried by some hundred handles spread over the mesh, so that it is smooth by
-construction, and held stiff between neighbouring handles; stiffness falls from round to round while
-closest points are found anew (Amberg, Romdhani, Vetter: Optimal Step Nonrigid ICP, 2007, with
-handles instead of vertices).
+Displacements of `HANDLES` handles are interpolated; differences of neighbouring handles are
+penalised with decreasing stiffness while closest points are updated (Amberg, Romdhani, Vetter:
+Optimal Step Nonrigid ICP, 2007, with handles instead of vertices).
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from reconstruction.head.pose import SurfaceSamples, tukey
 _NEAR = 8
 
 
-HANDLES = 200  # that carry the displacement
+HANDLES = 200
 STIFFNESS = (10.0, 1.0, 0.1, 0.01)
-"""Penalties on the difference of neighbouring handles against the mean squared distance."""
+"""Penalties on differences of neighbouring handles, relative to the mean squared distance."""
 
-ROUNDS = 4  # of finding nearest points, under each stiffness
-ANCHOR = 1e-3  # penalty on displacement as such, which fades it out where there are no points
+ROUNDS = 4  # of nearest points for each stiffness
+ANCHOR = 1e-3  # penalty on the displacement itself, which vanishes far from points
 
 
 @dataclass(frozen=True, eq=False)
 class Handles:
-    """`at (K, 3)`: where handles sit on the mesh at rest; `reach` is that of one, metres."""
+    """Handle positions `at (K, 3)` on the undeformed mesh; `reach` of each, metres."""
 
     at: Array
     reach: float
@@ -40,7 +39,7 @@ class Handles:
 
     @classmethod
     def on(cls, points: Array, count: int) -> Handles:
-        """`count` handles far from each other among `points (N, 3)`."""
+        """`count` handles by farthest-point sampling of `points (N, 3)`."""
         chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())]
         far = np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
@@ -56,7 +55,7 @@ class Handles:
         """Share `(N, K)` of each handle in the displacement at `points (N, 3)`; rows sum to 1."""
         k = min(_NEAR, len(self.at))
         distance, near = cKDTree(self.at).query(points, k=np.arange(1, k + 1))
-        # relative to the nearest: points far off all handles still get shares
+        # relative to the nearest, so that weights never vanish
         w = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.reach**2)
         w /= w.sum(axis=1, keepdims=True)
         row = np.repeat(np.arange(len(points)), k)
@@ -64,7 +63,7 @@ class Handles:
 
 
 def deform(mesh: Mesh, faces: Bools, points: Array, normals: Array | None, size: float) -> Mesh:
-    """The posed `mesh` deformed smoothly: its `faces (F,) bool` lie on `points (N, 3)`.
+    """The posed `mesh` deformed so that its `faces (F,) bool` lie on `points (N, 3)`.
 
     `size` is the head's radius in the points' unit.
     """

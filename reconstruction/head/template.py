@@ -1,4 +1,4 @@
-"""The user's head mesh made a template like the generic one: upright, in metres, scalp marked."""
+"""The user's head mesh as a template: z up, metres, scalp marked."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ def template(
 ) -> tuple[Mesh, HeadFit | None]:
     """`mesh` as a template: z up, face towards −y, metres, scalp marked.
 
-    `up` is the axis that points upwards; faces not wholly `above` that height (in the mesh's unit)
-    are cut off, as the body below a neck must be. A mesh that marks its scalp is in metres already
-    and is only turned. Of another, which may be in any unit and face any way, the largest piece is
-    kept (eyes and teeth are others), the generic head is laid under it to mark its scalp, and it
-    is moved into the generic head's frame; that fit is returned, too. Raises `HeadFitError`.
+    `up` is the mesh's up axis; faces not entirely above the height `above` (in the mesh's unit) are
+    removed, for a body below the neck. A mesh with a marked scalp must be in metres and is only
+    rotated. Of any other mesh, in any unit and direction, the largest connected part is kept, its
+    scalp is marked by fitting the generic head, and it is moved into the generic head's frame; that
+    fit is returned as well. Raises `HeadFitError`.
     """
     mesh = mesh.transformed(_TURNS[up], np.zeros(3))
     if above is not None:
         keep = np.asarray(mesh.vertices[mesh.faces][:, :, 2] > above)
         mesh = _faces_only(mesh, np.asarray(keep.all(axis=1)))
         if not len(mesh.faces):
-            raise HeadFitError(f"no face of the mesh lies wholly above {above:g}")
+            raise HeadFitError(f"no face of the mesh is entirely above {above:g}")
     if mesh.scalp is not None:
         return mesh, None
     marked, fit = mark_scalp(_largest_piece(mesh), seed=seed)
     assert marked.scalp is not None
     if not marked.scalp.any():
-        raise HeadFitError("no scalp could be told: is the mesh a head, and which way is it up?")
+        raise HeadFitError("no scalp was found: check that the mesh is a head and its up axis")
     return Mesh(fit.pose.inverse(marked.vertices), marked.faces, marked.scalp), fit
 
 
@@ -53,7 +53,7 @@ def _largest_piece(mesh: Mesh) -> Mesh:
 
 
 def _faces_only(mesh: Mesh, keep: Bools) -> Mesh:
-    """The mesh of some faces, without the vertices that none of them uses."""
+    """The mesh of some faces, without unused vertices."""
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
     scalp = None if mesh.scalp is None else mesh.scalp[keep]
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3), scalp)

@@ -1,1 +1,1 @@
-"""What pictures alone say: silhouettes, line orientation, hair features, segmentation."""
+"""Image analysis: silhouettes, line orientation, hair features, visual hull."""

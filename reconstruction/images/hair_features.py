@@ -1,12 +1,10 @@
-"""What tells hair from skin by its looks: gloss, colour, and how fine lines are.
+"""Features that separate hair from skin: gloss, colour and albedo.
 
-A matte surface answers a light by `albedo max(n·l, 0)` or, in a shadow, by less. Fibres answer with
-more than any such surface that fits them: they mirror some lights and let others through. How much
-more is the `gloss` of a pixel, a property of the true signal: noise adds to it and is averaged and
-taken off, so cleaner frames only tell better. Gloss needs a subject's pixels by the dozen; colour
-tells pixel by pixel, but not which class is hair: `two_classes` learns it from what is hair for
-sure, and what is less glossy.
-Skin is smooth at the width of a few pixels; fibres are lines there.
+A matte surface reflects a light as `albedo max(n·l, 0)`, less in shadow. Fibres reflect more than
+the best matte fit under some lights: they mirror and transmit. That excess is the `gloss` of a
+pixel; the contribution of noise is subtracted. Gloss is smooth over several pixels; colour is sharp
+but does not determine which class is hair: `two_classes` learns it from certain hair pixels and
+less glossy ones.
 """
 
 from __future__ import annotations
@@ -22,31 +20,30 @@ from reconstruction.images.grey import grey
 from reconstruction.images.silhouettes import background_noise
 
 FEWEST_LIGHTS = 8
-"""OLAT lights of a camera under which a pixel's answers to them say nothing."""
+"""Least number of OLAT lights of a camera for the features."""
 
 FAINTEST_GLOSS = float(np.log(0.12 + 0.03))
-"""Log gloss, as in `looks`, that hair surpasses: rendered hair has a gloss of 0.2, skin 0.05."""
+"""Log gloss, as in `looks`, exceeded by hair: rendered hair has a gloss of 0.2, skin 0.05."""
 
 _CLEAR = 4.0
-"""Deviations between classes' means from which they are two without an example of either: rendered
-hair and skin have 4.7 to 6.5, a tenth of the skin as well, hair alone has up to 3.6."""
+"""Standard deviations between the means of separate clusters: rendered hair and skin have 4.7 to
+6.5, hair alone up to 3.6."""
 _RIGHT = 0.8
-"""Of known hair, and of known skin, on its own side: half of each where the classes are one."""
+"""Share of known hair, and of known skin, that must be classified correctly."""
 _ITERATIONS = 25
-_SHADOWED = 0.5  # of what the matte surface in the open answers
-_LEAST_GLOSS = 0.03  # what a matte fit leaves of a matte surface that others light, too
-_MOST_PIXELS = 20_000  # that classes are learned from
+_SHADOWED = 0.5  # of the matte radiance: less is shadow
+_LEAST_GLOSS = 0.03  # of a matte surface with indirect light
+_MOST_PIXELS = 20_000  # used to estimate the classes
 _BLOCK = 1 << 14
-_LIKE_HAIR = 0.1  # the share of sure hair that is as little glossy as skin
+_LIKE_HAIR = 0.1  # share of hair that is no glossier than skin
 
 
 def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Array | None:
-    """How each of the P pixels of `subject (H, W)` answers single lights: `(4, P)`.
+    """Features `(4, P)` of the P pixels of `subject (H, W)` from single-light frames.
 
-    The log of the gloss, see `matte_fit`; log ratios of red to green and of green to blue under all
-    lights that do not saturate the pixel together; the log of the matte surface's albedo. Gloss and
-    albedo of answers averaged over 3×3 pixels. At most about `lights` of the lights are read. None
-    where fewer than `FEWEST_LIGHTS` that reach the head were shot, or the subject is empty.
+    Log gloss (`matte_fit`); log ratios red/green and green/blue of the sum over lights that do not
+    saturate the pixel; log albedo. Gloss and albedo are of 3×3 means. At most about `lights` lights
+    are read. None with fewer than `FEWEST_LIGHTS` lights that reach the head, or without a subject.
     """
     names = [n for n in capture.olat_lights() if capture.has_light(n, camera)]
     names = [n for n in names if capture.rig.light(n).intensity_towards(np.zeros(3)).any()]
@@ -80,13 +77,13 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
 def matte_fit(
     values: AnyFloats, directions: Array, noise: float = 0.0, known: Bools | None = None
 ) -> tuple[Array, Array]:
-    """Gloss and albedo `(N,)` of pixels that answer `values (N, L)` to lights from `directions`.
+    """Gloss and albedo `(N,)` of pixels with `values (N, L)` under lights from `directions`.
 
-    The matte surface `max(g·l, 0)` that fits best, with what answers less than half of it taken as
-    shadowed. Gloss is the root of the energy above that surface as a share of all of it, less
-    `noise`, the variance of the noise summed over lights; the albedo is |g|, in `values`' units.
-    `directions (L, 3)` are unit vectors. Values that are not `known (N, L)` are saturated: they do
-    not move the matte surface, and what they have above it is the least that they may have.
+    Fits a matte surface `max(g·l, 0)`; values below half of it count as shadow. Gloss is the root
+    of the energy above the surface as a share of the total, minus `noise`, the noise variance
+    summed over lights; the albedo is |g| in `values`' units. `directions (L, 3)` are unit vectors.
+    Values not `known (N, L)` are saturated: they do not enter the fit, and their excess is a lower
+    bound.
     """
     outer = (directions[:, :, None] * directions[:, None]).reshape(len(directions), 9)
     gloss, albedo = np.zeros((2, len(values)))
@@ -100,7 +97,7 @@ def matte_fit(
             g = np.linalg.solve(moments, ((lit * v) @ directions)[..., None])[..., 0]
             matte = np.maximum(g @ directions.T, 0)
             lit = whole & (v > _SHADOWED * matte) & (matte > 0)
-        # half of the noise about zero lies above it
+        # half of the noise is above zero
         above = (np.maximum(v - matte, 0) ** 2).sum(axis=1) - noise / 2
         energy = np.maximum((v**2).sum(axis=1) - noise, np.finfo(float).tiny)
         gloss[block] = np.sqrt(np.clip(above / energy, 0, 1))
@@ -110,9 +107,9 @@ def matte_fit(
 
 @dataclass(frozen=True, eq=False)
 class TwoClasses:
-    """Hair and skin by `looks`: the log of the odds that a pixel is hair is linear in them.
+    """Log odds of hair, linear in the features of `looks`.
 
-    `apart` is how many of their common deviations the classes' means are from each other.
+    `apart` is the distance of the classes' means in common standard deviations.
     """
 
     weights: Array
@@ -120,15 +117,15 @@ class TwoClasses:
     apart: float = 0.0
 
     def scores(self, looks: Array) -> Array:
-        """Log odds `(...)` for hair of `looks (4, ...)`, at most 5 either way."""
+        """Log odds `(...)` of hair for `looks (4, ...)`, clipped to ±5."""
         return np.asarray(np.clip(np.tensordot(self.weights, looks, 1) + self.offset, -5, 5))
 
 
 def clear_classes(looks: Array) -> TwoClasses | None:
-    """Hair and skin among pixels with `looks (N, 4)` that are two classes without any example.
+    """Hair and skin among pixels with `looks (N, 4)`, without examples.
 
-    Two Gaussians of one covariance that start from what is matte and what is not. None where they
-    are less than `_CLEAR` apart, or what started as hair has become the less glossy.
+    Two Gaussians with one covariance, initialised by gloss. None if they are less than `_CLEAR`
+    apart, or the hair class ends as the less glossy one.
     """
     x = looks[_few(looks)]
     found = _mixture(x, [0, 1, 2, 3], np.zeros(len(x), bool), x[:, 0] < FAINTEST_GLOSS)
@@ -140,13 +137,12 @@ def clear_classes(looks: Array) -> TwoClasses | None:
 
 
 def two_classes(looks: Array, hair: Bools) -> TwoClasses:
-    """Hair and skin among pixels with `looks (N, 4)`, where some, `hair (N,)`, are sure to be hair.
+    """Hair and skin among pixels with `looks (N, 4)`, of which `hair (N,)` are certainly hair.
 
-    Where these are no `clear_classes`, skin is looked for among the others with less gloss than
-    nine in ten of the sure ones; where these are no more than in hair itself, all of it is hair.
-    Where the classes that start from them overlap, the rest is as a whole what most of it is.
-    Where sure hair is matte, as what stands off a head that was misplaced, light cannot tell, and
-    all of the rest is skin.
+    Without `clear_classes`, skin is sought among the other pixels with less gloss than nine in ten
+    of the certain ones; if there are no more of them than in hair, all pixels are hair. If the
+    classes overlap, all other pixels get the class of their majority. If the certain hair is matte,
+    as with a misplaced head, all other pixels are skin.
     """
     if clear := clear_classes(looks):
         return clear
@@ -156,19 +152,18 @@ def two_classes(looks: Array, hair: Bools) -> TwoClasses:
     share = float(matte.sum() / max((~hair).sum(), 1))
     if share <= 2 * _LIKE_HAIR:
         return TwoClasses(np.zeros(4), 5.0)
-    pure = 1 - _LIKE_HAIR / share  # at least: one in ten of the hair is among them
+    pure = 1 - _LIKE_HAIR / share  # at most a tenth of the hair is among them
     other = TwoClasses(np.zeros(4), 1.0 if share < 0.5 else -1.0)
     return split(looks, hair, matte, pure) or other
 
 
 def split(looks: Array, hair: Bools, skin: Bools, pure: float = 1.0) -> TwoClasses | None:
-    """Hair and skin among pixels with `looks (N, 4)`, learned from examples of both.
+    """Hair and skin among pixels with `looks (N, 4)`, estimated from examples of both.
 
-    Two Gaussians of one covariance, by expectation and maximisation: `hair (N,)` stays hair, `skin
-    (N,)` is where the other class starts; a share `pure` of it, at least, is no hair. Of colour and
-    albedo, or where these do not tell the examples apart, of gloss, too, which is blurred and rises
-    in hair's shadow. None where they still do not: on its own side must be `_RIGHT` of the hair,
-    and as much of the pure share of the skin.
+    Two Gaussians with one covariance by expectation maximisation: `hair (N,)` stays hair, `skin
+    (N,)` initialises the other class, of which at least a share `pure` is not hair. First by colour
+    and albedo, then also by gloss, which is blurred and rises in hair's shadow. None unless
+    `_RIGHT` of the hair and of the pure share of the skin is classified correctly.
     """
     few = _few(looks)
     x, hair, skin = looks[few], hair[few], skin[few]
@@ -183,14 +178,14 @@ def split(looks: Array, hair: Bools, skin: Bools, pure: float = 1.0) -> TwoClass
 
 
 def _few(looks: Array) -> Ints:
-    """Numbers of the pixels that classes are learned from."""
+    """Indices of the pixels used to estimate the classes."""
     return np.random.default_rng(0).permutation(len(looks))[:_MOST_PIXELS]
 
 
 def _mixture(looks: Array, columns: list[int], hair: Bools, start: Bools) -> TwoClasses | None:
-    """The classes by these `columns` of `looks (N, 4)`, at even priors; None where one vanishes.
+    """The classes by these `columns` of `looks (N, 4)`, at even priors; None if one vanishes.
 
-    Even, since a prior would move the line between the classes where pixels show both.
+    A prior would shift the boundary in pixels that show both classes.
     """
     x = looks[:, columns]
     skin = np.where(hair, 0.0, np.where(start, 0.95, 0.05))

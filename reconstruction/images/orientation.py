@@ -1,4 +1,4 @@
-"""2D orientations of hair in images by a bank of log-Gabor filters (Sun §4.1, Photobooth §3.2)."""
+"""2D hair orientation in images by a bank of log-Gabor filters (Sun §4.1, Photobooth §3.2)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy import fft, ndimage
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.reconstruct_options import LogGaborBank
 
-_FAINTEST = 1e-5  # relative detail that is rounding in single precision and not texture
+_FAINTEST = 1e-5  # relative detail below this is single-precision rounding
 
 
 BANDWIDTH = float(np.log(2))  # σ_λ of every filter, natural logarithm
@@ -22,11 +22,10 @@ BANDWIDTH = float(np.log(2))  # σ_λ of every filter, natural logarithm
 def filters(bank: LogGaborBank, height: int, width: int) -> Iterator[Floats]:
     """The bank's `count` transfer functions `(H, W)`, in the layout of `fft2`.
 
-    exp(−log²(ρλ)/(2σ_λ²)) · exp(−Δ²/(2σ_φ²)): Sun Eq. 13 with the square that its print lost; ρ is
-    the frequency in cycles per pixel, Δ the angle to the filter's own. Filter k answers to lines at
-    k · 180°/count from +x towards +y: its own frequencies are perpendicular to the lines. Filters
-    are one-sided in frequency, so that the magnitude of an answer does not depend on whether the
-    pixel lies on a line or between two.
+    exp(−log²(ρλ)/(2σ_λ²)) · exp(−Δ²/(2σ_φ²)): Sun Eq. 13 with the square missing in print; ρ is the
+    frequency in cycles per pixel, Δ the angle to the filter's axis. Filter k responds to lines at
+    k · 180°/count from +x towards +y, perpendicular to its axis. Filters are one-sided in
+    frequency, so that the response magnitude does not depend on the phase of the lines.
     """
     fy = np.fft.fftfreq(height)[:, None]
     fx = np.fft.fftfreq(width)[None, :]
@@ -43,25 +42,25 @@ def filters(bank: LogGaborBank, height: int, width: int) -> Iterator[Floats]:
 
 
 def responses(bank: LogGaborBank, images: AnyFloats) -> Floats:
-    """Magnitudes `(count, H, W)` of the answers to an image `(H, W)`, mirrored at its edges.
+    """Response magnitudes `(count, H, W)` of an image `(H, W)`, mirrored at its edges.
 
-    Of a stack `(N, H, W)`, the sum of the magnitudes.
+    For a stack `(N, H, W)`, the sum of the magnitudes.
     """
     images = np.asarray(images, np.float32)
     stack = images[None] if images.ndim == 2 else images
     out = np.zeros((bank.count, *stack.shape[1:]), np.float32)
     one = np.empty_like(out)
     for image in stack:
-        _answer(bank, image, one)
+        _respond(bank, image, one)
         out += one
     return out
 
 
-def _answer(bank: LogGaborBank, image: Floats, out: Floats) -> None:
-    """Write the magnitudes `(count, H, W)` of the answers to one image into `out`.
+def _respond(bank: LogGaborBank, image: Floats, out: Floats) -> None:
+    """Write the response magnitudes `(count, H, W)` of one image into `out`.
 
-    A filter's frequencies lie in a narrow wedge: only its rows (or columns, if these are fewer)
-    are transformed first, and of the result only what lies on the image.
+    A filter's frequencies lie in a narrow wedge: only its rows (or columns, if fewer) are
+    transformed first, then only the part on the image.
     """
     shape = image.shape
     margin = int(min(4 * bank.wavelength * max(1.0, bank.count / (np.pi * bank.spread * 6)), 48))
@@ -76,20 +75,20 @@ def _answer(bank: LogGaborBank, image: Floats, out: Floats) -> None:
         if axis == 1:
             full = np.zeros((h, shape[1]), np.complex64)
             full[lines] = some[:, inner[1]]
-            answer = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
+            response = fft.ifft(full, axis=0, overwrite_x=True)[inner[0]]
         else:
             full = np.zeros((shape[0], w), np.complex64)
             full[:, lines] = some[inner[0]]
-            answer = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
-        np.abs(answer, out=out[k])
+            response = fft.ifft(full, axis=1, overwrite_x=True)[:, inner[1]]
+        np.abs(response, out=out[k])
 
 
-_NEGLIGIBLE = 1e-6  # of a filter's peak: what lies below is single precision's rounding
+_NEGLIGIBLE = 1e-6  # of a filter's peak: below is single-precision rounding
 
 
 @lru_cache(maxsize=4)
 def _wedges(bank: LogGaborBank, height: int, width: int) -> list[tuple[int, Ints, Floats]]:
-    """Each filter's axis to transform first, the lines along it that are not 0, and their values.
+    """Each filter's first axis to transform, its nonzero lines, and their values.
 
     Axis 1 has rows `(R, width)`, axis 0 columns `(height, C)`.
     """
@@ -108,8 +107,8 @@ def _wedges(bank: LogGaborBank, height: int, width: int) -> list[tuple[int, Ints
 class OrientationMap:
     """`angle (H, W)` in [0, π), undirected, from +x towards +y; `confidence (H, W)` in [0, 1].
 
-    Confidence is |Σ r e^{2iθ}| / Σ r over the bank's answers r: 0 for an isotropic answer, near 1
-    for a single orientation. It is 0 outside the mask.
+    Confidence is |Σ r e^{2iθ}| / Σ r over the bank's responses r: 0 if isotropic, near 1 for a
+    single orientation; 0 outside the mask.
     """
 
     angle: Floats
@@ -117,10 +116,10 @@ class OrientationMap:
 
 
 def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
-    """The image's relative detail `(H, W)`: over its mean near by in the mask, less 1.
+    """Relative detail `(H, W)`: the image over its local mean in the mask, minus 1.
 
-    The mean is a Gaussian one of `scale` pixels. Detail is 0 outside the mask, so the hair's
-    outline and slow shading do not answer as lines, and where there is no light.
+    The mean is Gaussian with `scale` pixels. Detail is 0 outside the mask and in the dark, so that
+    outline and shading give no response.
     """
     inside = mask.astype(np.float32)
     weight = ndimage.gaussian_filter(inside, scale)
@@ -139,12 +138,11 @@ def orientations(
 ) -> OrientationMap:
     """The orientation at every pixel of `mask (H, W)` from `images (N, H, W)`, one per lighting.
 
-    The lightings' answers are added, each by its brightness, and the winner taken once: a line too
-    faint to win under any one light still adds up under many. (Sun Eq. 2 averages each lighting's
-    winner.) The isotropic part of that sum, which noise leaves, does not count for confidence.
-
-    Where a lighting is not `known (N, H, W)`, as it is saturated, it has no detail. A winner is
-    refined below the bank's bins by the parabola through its neighbours.
+    Responses are summed over lightings, weighted by brightness, before the maximum is taken: lines
+    too faint under one light add up. (Sun Eq. 2 averages the maxima.) The isotropic part of the
+    sum, caused by noise, does not enter the confidence. Pixels of a lighting that are not `known
+    (N, H, W)` (saturated) have no detail. The maximum is refined by a parabola through its
+    neighbours.
     """
     images = np.asarray(images)
     if images.ndim == 2:
@@ -152,19 +150,19 @@ def orientations(
     if images.ndim != 3 or images.shape[1:] != mask.shape:
         wanted = f"(N, {mask.shape[0]}, {mask.shape[1]})"
         raise ValueError(f"expected images {wanted} like the mask, got {images.shape}")
-    answers = np.empty((bank.count, *mask.shape), np.float32)
-    total = np.zeros_like(answers)
+    response = np.empty((bank.count, *mask.shape), np.float32)
+    total = np.zeros_like(response)
     bright = float(np.abs(images[:, mask]).mean()) if mask.any() and len(images) else 0.0
     for k, image in enumerate(images):
         local = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), 4.0)
         lit = np.maximum(local, 0) / max(bright, 1e-30)
-        told = mask if known is None else mask & known[k]
-        _answer(bank, texture(image, told) * lit, answers)
-        total += answers
-    said = total.max(axis=0) > _FAINTEST
+        valid = mask if known is None else mask & known[k]
+        _respond(bank, texture(image, valid) * lit, response)
+        total += response
+    significant = total.max(axis=0) > _FAINTEST
     total -= total.min(axis=0)
     angle, confidence = _winner(total)
-    confidence = np.where(said, confidence, 0.0)
+    confidence = np.where(significant, confidence, 0.0)
     return OrientationMap(
         angle.astype(np.float32) % np.float32(np.pi),
         np.where(mask, np.clip(confidence, 0, 1), 0).astype(np.float32),
@@ -172,7 +170,7 @@ def orientations(
 
 
 def _winner(responses: Floats) -> tuple[Array, Array]:
-    """Angle and confidence `(H, W)` of the strongest of the answers `(count, H, W)`."""
+    """Angle and confidence `(H, W)` of the strongest of the responses `(count, H, W)`."""
     count = len(responses)
     peak = responses[0].copy()
     best = np.zeros(peak.shape, np.int64)

@@ -1,4 +1,4 @@
-"""Where a camera sees the subject at all, and how noisy its pictures are."""
+"""Silhouettes of the subject, and the noise of a camera's images."""
 
 from __future__ import annotations
 
@@ -7,25 +7,23 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Bools, Floats
-from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import Step
 from reconstruction.images.grey import grey
 
 NOISE_FACTOR = 5.0
-FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light, even without noise
-DARKEST = 0.05  # of the 95th percentile: what is densest above it is the subject
+FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light
+DARKEST = 0.05  # of the 95th percentile: a mode above it is the subject
 MOST_SATURATED = 0.02
 SMALLEST = 6  # pixels: smaller specks are noise
 
 
 class NoSilhouette(ValueError):
-    """A camera without the frames that a silhouette needs."""
+    """A camera without frames for a silhouette."""
 
 
 def dark_rgb(capture: Capture, camera: str, exposure: float | None = None) -> Floats:
-    """Mean of the camera's dark frames `(H, W, 3)`; zeros where none was shot.
-
-    With `exposure`, only the dark frames at the nearest exposure count.
-    """
+    """Mean of the camera's dark frames `(H, W, 3)`, of those nearest to `exposure`; else zeros."""
     steps = capture.dark_steps(camera, exposure)
     c = capture.rig.camera(camera)
     if not steps:
@@ -39,7 +37,7 @@ def dark_frame(capture: Capture, camera: str, exposure: float | None = None) -> 
 
 
 def dark_response(capture: Capture, step: Step, camera: str) -> tuple[Floats, Bools]:
-    """The frame less the dark one, at full level `(H, W, 3)`, and where it is saturated."""
+    """The frame minus the dark one at full level `(H, W, 3)`, and saturated pixels `(H, W)`."""
     image, saturated = capture.response_and_saturated(step, camera)
     dark = dark_rgb(capture, camera, step.exposure)
     return image - dark / np.float32(step.level or 1.0), saturated
@@ -53,9 +51,8 @@ def background_noise(image: AnyFloats) -> float:
 def noise_of_frames(images: AnyFloats, most: int = 1 << 22) -> float:
     """Standard deviation of unlit pixels in dark-subtracted frames `(N, H, W)` of one camera.
 
-    Of all frames together: where hair fills a lit frame no pixel of it is dark, and the more
-    faithfully its shadows are shown, the less that is; the darkest hair would be taken for black
-    whose noise was clipped. Evenly spaced rows of about `most` pixels are looked at.
+    All frames are used together: if hair fills a lit frame, no pixel of it is unlit. About `most`
+    pixels in evenly spaced rows are read.
     """
     rows = images.reshape(-1, images.shape[-1])
     return background_noise(rows[:: max(1, images.size // most)])
@@ -64,11 +61,10 @@ def noise_of_frames(images: AnyFloats, most: int = 1 << 22) -> float:
 def background(image: AnyFloats) -> tuple[float, float]:
     """Level and standard deviation of the unlit pixels of a dark-subtracted `image (...)`.
 
-    Noise about zero is symmetric and the subject only adds light, so the values below zero are the
-    lower half of the noise's distribution. Where none is below zero, black was clipped: what is
-    left of the noise is above it, most densely at the half-sample mode (Robertson and Cryer 1974),
-    and symmetric about that, unless it is still cut at zero. Both are 0 where zeros lie side by
-    side, black without noise, and where that mode is no darkness.
+    Noise is symmetric about zero and the subject only adds light, so negative values are the lower
+    half of the noise. Without negative values black was clipped: the noise then lies around the
+    half-sample mode (Robertson and Cryer 1974). Both are 0 for black without noise (adjacent zeros)
+    and if the mode is too bright for an unlit background.
     """
     below = -image[image < 0]
     if below.size:
@@ -76,7 +72,7 @@ def background(image: AnyFloats) -> tuple[float, float]:
     zero = image <= 0
     cut = zero.mean() > 0.01
     if cut and (zero[..., :-1] & ~zero[..., 1:]).sum() < 0.3 * zero[..., :-1].sum():
-        return 0.0, 0.0  # zeros lie side by side: black without noise
+        return 0.0, 0.0  # adjacent zeros: black without noise
     values = np.sort(image[~zero], axis=None)
     level = _half_sample_mode(values)
     if not 0 < level < DARKEST * float(np.quantile(values, 0.95)):
@@ -86,7 +82,7 @@ def background(image: AnyFloats) -> tuple[float, float]:
 
 
 def _half_sample_mode(values: AnyFloats) -> float:
-    """Where sorted `values (N,)` are densest: the densest half of the densest half, and so on."""
+    """Mode of sorted `values (N,)`: the densest half of the densest half, and so on."""
     while len(values) > 2:
         half = (len(values) + 1) // 2
         first = int(np.argmin(values[half - 1 :] - values[: len(values) - half + 1]))
@@ -100,11 +96,11 @@ def lit_image(capture: Capture, camera: str) -> Floats:
 
 
 def lit_rgb(capture: Capture, camera: str) -> Floats:
-    """The subject under as many lights as the capture has, less the dark frame `(H, W, 3)`.
+    """The subject under all lights minus the dark frame `(H, W, 3)`.
 
     The all-on frame at full level, else the sum of the OLAT frames, else the first tracking frame;
-    one that is saturated in over `MOST_SATURATED` of what is lit only where no other kind is there.
-    Raises `NoSilhouette` where the camera has none of them.
+    frames with over `MOST_SATURATED` saturated lit pixels come last. Raises `NoSilhouette` without
+    any of them.
     """
     blown: list[Step] = []
     for kind, first in (("all_on", True), ("olat", False), ("tracking", True)):
@@ -125,14 +121,13 @@ def _blown(capture: Capture, camera: str, step: Step) -> bool:
 
 
 def silhouette(capture: Capture, camera: str) -> Bools:
-    """Pixels `(H, W)` of the subject: as the capture has it told from the background, else where it
-    adds light: above the noise, specks removed, holes filled.
+    """Pixels `(H, W)` of the subject: the user's mask, else lit pixels without specks and pinholes.
 
-    Raises `NoSilhouette` where the camera has no frame to tell from.
+    Raises `NoSilhouette` for a camera without lit frames.
     """
-    if (told := capture.subject(camera)) is not None:
-        return told
-    if camera in capture.lenses:  # resampled, the faintest light spreads by a pixel
+    if (given := capture.subject(camera)) is not None:
+        return given
+    if camera in capture.lenses:  # resampling would spread faint light by a pixel
         bent = silhouette(capture.view(undistorted=False), camera)
         return capture.lenses[camera].undistort_mask(bent)
     image = lit_image(capture, camera)
@@ -150,7 +145,7 @@ def silhouette(capture: Capture, camera: str) -> Bools:
 
 
 def _fill_pinholes(mask: Bools) -> Bools:
-    """Close holes of under `SMALLEST` pixels; larger ones are what one sees through a curl."""
+    """Close holes of under `SMALLEST` pixels; larger ones may be gaps in the hair."""
     holes, count = ndimage.label(~mask)
     area = np.bincount(holes.ravel(), minlength=count + 1)
     return mask | ((area < SMALLEST)[holes] & ~mask)

@@ -1,4 +1,4 @@
-"""The visual hull: the largest volume that agrees with every camera's mask."""
+"""The visual hull: the largest volume consistent with every camera's mask."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.voxels import VoxelGrid
 
-BLOCK = 8  # voxels along the edge of the blocks that are carved as a whole before single voxels are
+BLOCK = 8  # voxels along the edge of the blocks that are tested first
 MOST_VOXELS = 400_000_000
 
 
@@ -27,17 +27,17 @@ def visual_hull(
 ) -> VoxelGrid:
     """Carve the volume that projects into `masks[camera.name] (H, W) bool` of every camera.
 
-    A voxel belongs to the hull if its centre falls on the mask of every camera whose image it falls
-    on, and it falls on at least `least_views` images (or all, if there are fewer). An image that a
-    voxel misses carves it too, except past an edge that the mask touches: there the image may cut
-    the subject off. A camera without a mask takes no part. The masks are of everything that the
-    hull shall hold: where a head hides hair, give both together (see `mesh_silhouette`).
+    A voxel is inside if its centre projects into the mask of every camera whose image contains it,
+    and into at least `least_views` images (or all, if fewer). Outside an image it is removed,
+    except beyond an edge that the mask touches, where the image may crop the subject. Cameras
+    without a mask are ignored. If a head hides hair, the masks must hold both (see
+    `mesh_silhouette`).
 
-    `spacing` is in metres; `bounds (2, 3)` gives the lowest and highest corner, by default the
-    hull's own box is found.
+    `spacing` is in metres; `bounds (2, 3)` are the lowest and highest corner, by default the hull's
+    box.
 
-    Raises `ValueError` when no camera has a mask, a mask's shape is not its camera's, a mask is
-    empty, or the grid would be absurdly large.
+    Raises `ValueError` without a mask, for a mask of a wrong shape, an empty mask, or more than
+    `MOST_VOXELS` voxels.
     """
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, got {spacing}")
@@ -53,17 +53,19 @@ def visual_hull(
     shape = np.maximum(np.ceil((box[1] - box[0]) / spacing), 1).astype(np.int64)
     if np.prod(shape.astype(float)) > MOST_VOXELS:
         whole = [v.camera.name for v in views if v.mask.mean() > 0.95]
-        hint = f"; the masks of {', '.join(whole)} fill their pictures: " if whole else ""
-        hint += "is the background dark? else give clean plates or masks of the subject" * bool(
-            whole
-        )
+        hint = ""
+        if whole:
+            hint = (
+                f"; the masks of {', '.join(whole)} fill their images: if the background is lit, "
+            )
+            hint += "provide clean plates or masks of the subject"
         size = f"a grid of {shape.tolist()} voxels is too large"
-        raise ValueError(f"{size}: take a spacing above {spacing} m{hint}")
+        raise ValueError(f"{size}: use a spacing above {spacing} m{hint}")
     return VoxelGrid(box[0] + spacing / 2, spacing, _carve(views, box[0], spacing, shape, least))
 
 
 class _MaskView:
-    """A camera, its mask, and for every pixel the distance (pixels) to the mask or to its edge."""
+    """A camera, its mask, and each pixel's distance to the mask's edge in pixels."""
 
     def __init__(self, camera: Camera, mask: Bools) -> None:
         mask = np.asarray(mask, bool)
@@ -72,22 +74,22 @@ class _MaskView:
                 f"{camera.name}: its mask must be {(camera.height, camera.width)}, got {mask.shape}"
             )
         if not mask.any():
-            raise ValueError(f"{camera.name}: its mask is empty; leave the camera out instead")
+            raise ValueError(f"{camera.name}: its mask is empty: omit the camera")
         self.camera, self.mask = camera, mask
         self.focal = max(camera.K[0, 0], camera.K[1, 1])
-        # where the mask touches an edge of the image, the subject may go on beyond that edge
+        # the subject may continue beyond an edge that the mask touches
         sides = mask[:, 0].any(), mask[0].any(), mask[:, -1].any(), mask[-1].any()
         self.left, self.top, self.right, self.bottom = (np.inf if s else 0.5 for s in sides)
         self.cropped = any(sides)
-        framed = np.pad(mask, 1)  # beyond the image nothing is surely inside
+        framed = np.pad(mask, 1)  # outside the image nothing is certainly inside
         self.within = cv2.distanceTransform(framed.astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-        if mask.all():  # OpenCV has no distance to a background that is not there
+        if mask.all():  # OpenCV needs a background
             self.outside = np.zeros(mask.shape, np.float32)
         else:
             self.outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
 
     def cut_off(self, points: Array, radius: float = 0.0) -> Bools:
-        """Whether balls about `points (M, 3)` reach past an edge where the subject may go on."""
+        """Whether balls at `points (M, 3)` extend past an edge that may crop the subject."""
         pixels, depth = self.camera.project(points)
         front = depth > 1e-6
         reach = 1.5 * self.focal * radius / np.maximum(depth - radius, 1e-9)
@@ -100,7 +102,7 @@ class _MaskView:
         return np.asarray(front & allowed & off)
 
     def on_mask(self, points: Array) -> Bools:
-        """Whether `points (M, 3)` fall on a pixel of the mask. The carve's hot loop."""
+        """Whether `points (M, 3)` project into the mask; the hot loop."""
         c = self.camera
         x, y, z = (c.K @ c.R) @ points.T + (c.K @ c.t)[:, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -111,9 +113,9 @@ class _MaskView:
         return on
 
     def balls(self, points: Array, radius: float) -> tuple[Bools, Bools]:
-        """Whether balls about `points (M, 3)` may touch the mask, and surely lie within it."""
+        """Whether balls at `points (M, 3)` may touch the mask, and certainly project inside it."""
         pixels, depth = self.camera.project(points)
-        # a ball's outline grows towards the image's edges; 1.5 covers 48 degrees off the axis
+        # outlines grow towards the image edges; 1.5 covers 48 degrees off the axis
         reach = 1.5 * self.focal * radius / np.maximum(depth - radius, 1e-9) + 1.5
         size = np.array([self.camera.width, self.camera.height])
         near = np.clip(np.rint(pixels), 0, size - 1)
@@ -125,7 +127,7 @@ class _MaskView:
 
 
 def _balls(views: list[_MaskView], points: Array, radius: float, least: int) -> tuple[Bools, Bools]:
-    """Whether balls about `points (M, 3)` may hold a part of the hull, and are wholly inside it."""
+    """Whether balls at `points (M, 3)` may intersect the hull, and are entirely inside it."""
     alive, whole = np.arange(len(points)), np.ones(len(points), bool)
     count = np.zeros(len(points), np.int64)
     for view in views:
@@ -155,7 +157,7 @@ def _points(views: list[_MaskView], points: Array, least: int) -> Bools:
 
 
 def _carve(views: list[_MaskView], low: Array, spacing: float, shape: Ints, least: int) -> Bools:
-    """The inside voxels `shape`: blocks of `BLOCK`³, then the voxels of those that are mixed."""
+    """Inside voxels of a grid of `shape`: blocks of `BLOCK`³ first, then voxels of mixed blocks."""
     blocks = -(-shape // BLOCK)
     out = np.zeros((*blocks, BLOCK, BLOCK, BLOCK), bool)
     edge = BLOCK * spacing
@@ -179,7 +181,7 @@ def _indices(shape: Ints) -> Ints:
 
 
 def _find_bounds(views: list[_MaskView], least: int) -> Array:
-    """A box `(2, 3)` around the hull: a coarse carve around the masks' common centre, thrice."""
+    """A box `(2, 3)` around the hull, by three coarse hulls around the masks' common centre."""
     center = _common_center(views)
     distance = min(float(np.linalg.norm(v.camera.center - center)) for v in views)
     box = np.stack([center - 0.9 * distance, center + 0.9 * distance])
@@ -190,14 +192,15 @@ def _find_bounds(views: list[_MaskView], least: int) -> Array:
         alive = centers[_balls(views, centers, edge * np.sqrt(3) / 2, least)[0]]
         if not len(alive):
             raise ValueError(
-                "the masks have no volume in common: are the cameras' poses and masks of one scene?"
+                "the masks have no volume in common: check that camera poses and masks "
+                "are of one scene"
             )
         box = np.stack([alive.min(axis=0) - edge, alive.max(axis=0) + edge])
     return box
 
 
 def _common_center(views: list[_MaskView]) -> Array:
-    """The point nearest to the rays through the masks' centroids, in the least-squares sense."""
+    """The least-squares intersection of the rays through the masks' centroids."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         row, column = np.argwhere(view.mask).mean(axis=0)
@@ -206,15 +209,14 @@ def _common_center(views: list[_MaskView]) -> Array:
         A += across
         b += across @ view.camera.center
     if np.linalg.cond(A) > 1e6:
-        raise ValueError("the masked cameras all look the same way: give bounds for the hull")
+        raise ValueError("the masked cameras have parallel axes: give bounds for the hull")
     return np.asarray(np.linalg.solve(A, b))
 
 
 def trim_edges(mask: Bools, hair: Bools) -> Bools:
-    """`mask (H, W)` without the pixels on the image's edges that `hair (H, W)` does not hold.
+    """`mask (H, W)` without pixels on the image edges that are not `hair (H, W)`.
 
-    A neck runs out of most images where the hair does not. The hull of masks trimmed like this
-    ends at such an edge instead of going on beyond it.
+    Most images crop the neck but not the hair; the hull of trimmed masks ends at such an edge.
     """
     out = mask.copy()
     for side in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
@@ -228,11 +230,11 @@ def space_carve(
     first_surface: Mapping[str, AnyFloats],
     margin: float = 0.0,
 ) -> VoxelGrid:
-    """The hull without the voxels that some camera saw through (space carving).
+    """Space carving: the hull without voxels in front of a camera's first visible surface.
 
-    `first_surface[name] (H, W)` is the depth along that camera's z, metres, of the first thing
-    each pixel sees: infinite where the pixel sees nothing at all, 0 where nothing is known. Voxels
-    more than `margin` metres in front of it are empty; voxels off an image are not judged by it.
+    `first_surface[name] (H, W)` is the depth of that surface along the camera's z, metres: infinite
+    where nothing is visible, 0 where unknown. Voxels more than `margin` metres in front of it are
+    removed.
     """
     index = np.argwhere(hull.inside)
     for camera in (c for c in cameras if c.name in first_surface):
@@ -240,8 +242,8 @@ def space_carve(
         if first.shape != (camera.height, camera.width):
             size = (camera.height, camera.width)
             raise ValueError(f"{camera.name}: first_surface must be {size}, got {first.shape}")
-        seen, x, y, depth = camera.pixels_of(hull.centers(index))
-        index = index[~seen | (depth >= first[y, x] - margin)]
+        inside, x, y, depth = camera.pixels_of(hull.centers(index))
+        index = index[~inside | (depth >= first[y, x] - margin)]
     inside = np.zeros_like(hull.inside)
     inside[tuple(index.T)] = True
     return replace(hull, inside=inside)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import Bools, Floats
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey

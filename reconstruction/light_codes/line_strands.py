@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array
-from reconstruction.capture.folder import CaptureError
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import surface_samples
 from reconstruction.geometry.voxels import VoxelGrid

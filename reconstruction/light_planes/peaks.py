@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Floats, Ints
-from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import Step
 from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import background_noise, dark_frame
 

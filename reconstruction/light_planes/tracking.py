@@ -16,7 +16,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from reconstruction.arrays import Array
-from reconstruction.capture.folder import Capture, Step
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import Step
 from reconstruction.geometry.cameras import Camera
 from reconstruction.images.silhouettes import dark_frame
 from reconstruction.light_planes.motion import Motion

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.projectors import Projector
 from reconstruction.images.silhouettes import NoSilhouette, silhouette
 from reconstruction.light_planes.motion import Motion

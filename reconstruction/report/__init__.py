@@ -1,1 +1,1 @@
-"""Reports of what was done: figures, plots, memory."""
+"""Reports of pipeline stages: figures, plots, progress, memory."""

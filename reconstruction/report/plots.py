@@ -20,7 +20,7 @@ WIDTH = 9.0
 
 
 def plot_report(report: Report, folder: str | Path) -> list[Path]:
-    """Draw what the report holds into PNGs in `folder` and return their paths.
+    """Draw a report into PNGs in `folder` and return their paths.
 
     `seconds.png` (time per stage) and `error_<stage>.png` for each stage that recorded error
     against run time.
@@ -39,10 +39,10 @@ def plot_report(report: Report, folder: str | Path) -> list[Path]:
 
 
 def plot_geometry(results: Mapping[str, Mapping[str, Any]], path: str | Path) -> Path:
-    """Bars of precision, recall and F, one group per threshold, one row for visible and for all.
+    """Bars of precision, recall and F by threshold, one row each for visible and all points.
 
-    `results` maps a name ("ours", "hull_vertical", ...) to what `compare_strands` returned for it;
-    the first is drawn as the one that the others are compared with.
+    `results` maps names ("ours", "hull_vertical", ...) to results of `compare_strands`; the first
+    is emphasised.
     """
     if not results:
         raise ValueError("no results to draw")
@@ -108,7 +108,7 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, kind in zip(grid, kinds, strict=False):
         members = [s for s in series if s.error == kind]
-        # a logarithmic axis has no zero: what was there from the start is drawn at its left end
+        # zero seconds are drawn at the left end of the logarithmic axis
         start = 0.5 * min((t for s in members for t, _ in s.points if t > 0), default=2e-3)
         for k, s in enumerate(members):
             points = np.array([p for p in s.points if p[1] > 0], float).reshape(-1, 2)
@@ -132,7 +132,7 @@ def _errors(stage: str, series: Sequence[Series]) -> Figure:
 
 
 def clean_axes(axes: Axes, grid_axis: Any) -> None:
-    """Take away what carries no figure; faint lines across `grid_axis` (x, y or both)."""
+    """Remove spines and ticks; faint grid lines across `grid_axis` (x, y or both)."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
     axes.tick_params(colors=QUIET, labelsize=9, length=0, which="both")
@@ -145,7 +145,7 @@ def _note(axes: Axes, text: str, at: Any, offset: tuple[int, int], style: dict[s
 
 
 def _threshold(name: str) -> str:
-    """`1mm_10deg` as in print."""
+    """`1mm_10deg` for display."""
     return name.replace("mm_", " mm\n").replace("deg", "°")
 
 
@@ -160,7 +160,7 @@ def _duration(seconds: float) -> str:
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a PNG, whole or not at all, and return its path."""
+    """Write a PNG atomically and return its path."""
     FigureCanvasAgg(figure)
     with writing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130, facecolor="white")

@@ -1,4 +1,4 @@
-"""Progress of a whole, told by its parts."""
+"""Overall progress from the progress of stages."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ SECONDS = {
     "refinement": 22,
     "roots": 3,
 }
-"""About what stages of a reconstruction take beside each other: a sweep's on the demo's capture,
-line stereo's on a patch of 24 cameras."""
+"""Relative duration of reconstruction stages: of a sweep on the demo's capture, of line stereo on a
+patch of 24 cameras."""
 
 
-class ToldReport(Report):
-    """A report whose stages tell `progress`: a `Progress` that goes from 0 to 1 over all of them.
+class ReportWithProgress(Report):
+    """A report that calls `progress` with the share of all stages, from 0 to 1.
 
-    `stages` are those expected, in their order. A stage tells 0 to 1 of itself, which is its share
-    of what is left: one that does not come, or comes unexpected, takes nothing back.
+    `stages` are expected in this order. Each stage reports 0 to 1, scaled to its share of the
+    remaining time; skipped and unexpected stages never decrease the progress.
     """
 
     def __init__(self, progress: Progress, stages: Sequence[str]) -> None:
@@ -59,6 +59,6 @@ class ToldReport(Report):
             yield stage
 
     def progress(self, what: str, share: float) -> None:
-        """Tell of a `share` of the stage that began last."""
+        """Report the `share` done of the stage that began last."""
         self._done = max(self._done, self._begin + (self._end - self._begin) * min(share, 1.0))
         self._progress(what, self._done)

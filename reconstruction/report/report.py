@@ -1,4 +1,4 @@
-"""One report for every stage: seconds, error against run time, work left out, warnings."""
+"""The report of a pipeline: per stage seconds, figures, error against run time, warnings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from reconstruction.files.durable import write_json
 from reconstruction.options import sentence
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the share that is done, 0 to 1."""
+"""Called with the current activity and the share done, 0 to 1."""
 
 
 def silent(_what: str, _share: float) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that does nothing."""
 
 
 _RESET, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
@@ -27,7 +27,7 @@ _RESET, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 @dataclass(eq=False)
 class Peak:
-    """`gb`: resident memory of the whole process at its peak, GB; None where it is not known."""
+    """`gb`: peak resident memory of the process, GB; None if unknown."""
 
     gb: float | None = None
 
@@ -37,8 +37,8 @@ _open: list[Peak] = []
 
 @contextmanager
 def peak_memory() -> Iterator[Peak]:
-    """Measure the block; blocks may hold others, but not run on several threads."""
-    _note()  # what came before belongs to the blocks around this one
+    """Measure the block; blocks may be nested, but not run on several threads."""
+    _note()  # earlier memory counts for the enclosing blocks
     peak = Peak()
     _open.append(peak)
     with suppress(OSError):
@@ -51,12 +51,12 @@ def peak_memory() -> Iterator[Peak]:
 
 
 def free_memory() -> float | None:
-    """GB that processes may still take; None where it is not known."""
+    """Available memory, GB; None if unknown."""
     return _gb(Path("/proc/meminfo"), "MemAvailable")
 
 
 def resident_memory() -> float | None:
-    """GB that this process holds now; None where it is not known."""
+    """Resident memory of this process, GB; None if unknown."""
     return _gb(_STATUS, "VmRSS")
 
 
@@ -77,7 +77,7 @@ def _gb(path: Path, name: str) -> float | None:
 
 @dataclass
 class Series:
-    """Error against run time: `points` are (seconds, error) in the order they were reached."""
+    """Error against run time: `points` are (seconds, error), in order."""
 
     name: str
     error: str
@@ -86,7 +86,7 @@ class Series:
 
 @dataclass
 class LeftOut:
-    """Work that this scene does not need: `what`, `why`, and what leaving it out `saved`."""
+    """Skipped work: `what`, `why` it is not needed, and what was `saved`."""
 
     what: str
     why: str
@@ -95,9 +95,9 @@ class LeftOut:
 
 @dataclass
 class Stage:
-    """One stage of a pipeline: `figures` holds its numbers by name, JSON-ready.
+    """One stage of a pipeline: `figures` are its numbers by name, JSON-ready.
 
-    `peak_gb` is the most memory that the process held meanwhile, None where it is not known.
+    `peak_gb` is the peak memory of the process during the stage, None if unknown.
     """
 
     name: str
@@ -109,15 +109,15 @@ class Stage:
     peak_gb: float | None = None
 
     def leave_out(self, what: str, why: str, saved: str) -> None:
-        """Record work that was not done because the scene does not need it."""
+        """Record skipped work."""
         self.left_out.append(LeftOut(what, why, saved))
 
     def warn(self, message: str) -> None:
-        """Record a warning, on conditioning or on data that was not there."""
+        """Record a warning."""
         self.warnings.append(message)
 
     def take(self, other: Stage) -> None:
-        """Take over what another stage found and said."""
+        """Merge the records of another stage."""
         self.figures |= other.figures
         self.series += other.series
         self.left_out += other.left_out
@@ -126,16 +126,13 @@ class Stage:
 
 @dataclass
 class Report:
-    """The stages that a model went through, in order."""
+    """The stages of a model, in order."""
 
     stages: list[Stage] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
-        """Time a stage, without the stages within it: the seconds of all add up to the run time.
-
-        A stage of the same name from an earlier run is replaced.
-        """
+        """Time a stage, excluding nested stages; replaces a stage of the same name."""
         stage = Stage(name)
         self.drop(name)
         self.stages.append(stage)
@@ -150,7 +147,7 @@ class Report:
         stage.peak_gb = peak.gb
 
     def drop(self, name: str) -> None:
-        """Forget the stage of that name from an earlier run, where there is one."""
+        """Remove the stage of that name, if present."""
         self.stages = [s for s in self.stages if s.name != name]
 
     def __getitem__(self, name: str) -> Stage:
@@ -169,10 +166,10 @@ class Report:
 
     @classmethod
     def load(cls, path: str | Path) -> Report:
-        """Read a report; an absent file gives an empty one. `ValueError` names a damaged one."""
+        """Read a report, empty without a file. Raises `ValueError` for a damaged file."""
         if not Path(path).is_file():
             return cls()
         try:
             return TypeAdapter(cls).validate_json(Path(path).read_bytes())
         except ValidationError as error:
-            raise ValueError(f"{path} is no report: {sentence(error)}") from error
+            raise ValueError(f"{path}: not a report: {sentence(error)}") from error

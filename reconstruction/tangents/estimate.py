@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Floats, Ints
-from reconstruction.capture.folder import Capture, CaptureError
+from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey

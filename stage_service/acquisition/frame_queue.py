@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass, replace
 
 from reconstruction import CaptureWriter, Rig, Step
-from reconstruction.capture.folder import FrameRecord
+from reconstruction.capture.records import FrameRecord
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
 THREADS = (os.cpu_count() or 1) + 2

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from statistics import median
 
 from reconstruction import Step
-from reconstruction.capture.folder import StepKind
+from reconstruction.capture.records import StepKind
 from stage_service.acquisition.states import Progress
 
 NOTIFY_S = 0.2

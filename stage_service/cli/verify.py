@@ -100,7 +100,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         sheet = out.with_name(f"{out.name}-contact-sheet.png")
         sheet.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(understood, sheet)
-        text = "\n".join([*understood.said(), f"{sheet}: contact sheet"])
+        text = "\n".join([*understood.summary(), f"{sheet}: contact sheet"])
         output.result({"sheet": str(sheet), **understood.counts(), "notes": notes}, text)
         return
     with progress_bar("import") as progress:

@@ -61,7 +61,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     assert not world.projectors.show.level
     (outcome, never) = verify(tmp_path / "c")
     assert "outcome is 'failed'" in outcome
-    assert "never shot" in never
+    assert "never captured" in never
     told("disk: no room left", stepping, "failed", 0, run.error)
 
     again = CaptureWriter.reopen(tmp_path / "c")

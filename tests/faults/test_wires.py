@@ -269,7 +269,7 @@ def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, t
     capture = Capture(tmp_path / "c")
     check_frames(capture)
     for problem in verify(tmp_path / "c"):
-        assert re.search(r"outcome is|never shot|^Step \d+ .* is missing", problem), problem
+        assert re.search(r"outcome is|never captured|^Step \d+ .* is missing", problem), problem
     missing = sum(r.file is None for r in capture.records.values())
     assert missing == one.missing
     if one.error:

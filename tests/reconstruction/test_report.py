@@ -11,7 +11,7 @@ import pytest
 
 from reconstruction import Report, Stage, silent
 from reconstruction.report.plots import plot_geometry, plot_report
-from reconstruction.report.progress import ToldReport
+from reconstruction.report.progress import ReportWithProgress
 from reconstruction.report.report import LeftOut, Series
 
 
@@ -56,7 +56,9 @@ def test_a_stage_that_fails_is_timed_too() -> None:
 
 def test_a_stage_that_was_not_expected_or_does_not_come_takes_no_progress_back() -> None:
     told: list[float] = []
-    report = ToldReport(lambda _, share: told.append(share), ["masks", "depth", "field", "roots"])
+    report = ReportWithProgress(
+        lambda _, share: told.append(share), ["masks", "depth", "field", "roots"]
+    )
     for name in ("masks", "lightcodes", "field", "roots"):
         with report.stage(name):
             for share in (0.5, 0.2, 1.0):
@@ -153,5 +155,5 @@ def test_a_stage_within_another_is_not_counted_twice(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(("text", "said"), [('{"stages": 3}', "stages: "), ("{", "Invalid JSON")])
 def test_a_damaged_report_is_named(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "report.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"report\.json is no report: .*{said}"):
+    with pytest.raises(ValueError, match=rf"report\.json: not a report: .*{said}"):
         Report.load(tmp_path / "report.json")

@@ -34,10 +34,10 @@ def test_a_killed_service_leaves_no_lamp_lit_and_every_finished_frame(stage):
     missing = stage.FRAMES - len(frames)
     assert problems[:2] == [
         "manifest.json is missing: the capture was not finished.",
-        f"{missing} planned frames were never shot; the first is step "
+        f"{missing} planned frames were never captured; the first is step "
         f"{len(frames) // stage.CAMERAS} (olat), cam_{len(frames) % stage.CAMERAS}.",
     ]
-    assert all("are in no line of the journal" in left_over for left_over in problems[2:])
+    assert all("are not listed in the journal" in left_over for left_over in problems[2:])
     stage.serve()
     known = stage.get(f"/captures/{capture['id']}")
     assert (known["state"], known["outcome"]) == ("done", "interrupted")

@@ -1,9 +1,9 @@
-"""Cameras as others write them: COLMAP, Metashape, nerfstudio, OpenCV.
+"""Camera files of COLMAP, Metashape, nerfstudio, OpenCV and The Captury.
 
     file = read_cameras("sparse/0")
     file.cameras, file.notes
 
-Camera axes and pixel centres become ours; units and the world's axes stay the file's: see
+Camera axes and pixel centres are converted; units and world axes remain the file's, see
 `reconstruction.geometry.placement`.
 """
 
@@ -35,10 +35,7 @@ _KNOWN = (
 
 
 def read_cameras(path: str | Path) -> CameraFile:
-    """The cameras of a file or folder, whichever of the formats it is.
-
-    Raises `CameraFileError` (a `ValueError`) that says what is wrong with it, or that it is none.
-    """
+    """The cameras of a file or folder in any of the formats. Raises `CameraFileError`."""
     path = Path(path)
     try:
         return _read(path)
@@ -66,7 +63,7 @@ def _read(path: Path) -> CameraFile:
         return read_opencv(path)
     if path.suffix == ".calib":
         return read_calib(path)
-    raise CameraFileError(f"{path}: no format that is known: {_KNOWN}")
+    raise CameraFileError(f"{path}: unknown format; expected {_KNOWN}")
 
 
 def _read_folder(path: Path) -> CameraFile:
@@ -77,7 +74,7 @@ def _read_folder(path: Path) -> CameraFile:
         return _read(path / "transforms.json")
     if files := sorted(f for f in path.iterdir() if f.suffix in SUFFIXES):
         return read_opencv_folder(path, files)
-    raise CameraFileError(f"{path}: none of what is known is in it: {_KNOWN}")
+    raise CameraFileError(f"{path}: no camera file found; expected {_KNOWN}")
 
 
 def _read_json(path: Path) -> CameraFile:
@@ -86,7 +83,7 @@ def _read_json(path: Path) -> CameraFile:
         return read_transforms(path, data)
     if isinstance(data, dict):
         return cameras_from(path, data)
-    raise CameraFileError(f"{path}: expected an object, with 'frames' or a map for each camera")
+    raise CameraFileError(f"{path}: expected an object with 'frames' or a map for each camera")
 
 
 def _root(path: Path) -> ElementTree.Element:

@@ -1,8 +1,7 @@
-"""`cameras.calib`, "tc camera calibration": as The Captury's tools and HumanOLAT have it.
+"""`cameras.calib`, "tc camera calibration", of The Captury's tools and HumanOLAT.
 
-For each camera `origin`, `up` and `right` in the world, in millimetres; the focal length and the
-principal point's offset from the picture's middle as shares of a sensor. Pixels are not named: the
-pictures' size is. `up` is the way of the picture's rows upwards.
+For each camera `origin`, `up` and `right` in the world, millimetres; the focal length and the
+principal point's offset from the middle as shares of the sensor size, independent of pixels.
 """
 
 from __future__ import annotations
@@ -18,14 +17,13 @@ from reconstruction.geometry.lens_models import LensModel
 
 HEAD = "tc camera calibration"
 WIDTH = 4096
-"""Pixels across in which the cameras are given: `resized` scales them to the pictures."""
+"""Image width of the returned cameras: `resized` scales them to the images."""
 
 
 def read_calib(path: Path) -> CameraFile:
     """The cameras, `Cam01` and on, through a sensor of `WIDTH` pixels; millimetres.
 
-    The distortion is OpenCV's k1, k2, p2, p1, k3. Raises `CameraFileError` naming the camera and
-    the field.
+    The distortion is OpenCV's k1, k2, p2, p1, k3. Raises `CameraFileError`.
     """
     lines = plain_file(path).read_text().splitlines()
     if not lines or not lines[0].startswith(HEAD):
@@ -72,7 +70,7 @@ def _camera(path: Path, i: int, block: dict[str, list[str]]) -> Camera:
     )
     right, up = (np.array(numbers(k, 3)) for k in ("right", "up"))
     R = np.stack([right, -up, np.cross(right, -up)])
-    U, _, V = np.linalg.svd(R)  # the file's digits are few
+    U, _, V = np.linalg.svd(R)  # the file has few digits
     k1, k2, p2, p1, k3 = numbers("distortion", 5)
     lens = LensModel("opencv", np.array([k1, k2, p1, p2, k3]))
     return camera_of(where, name, size, K, (U @ V, -(U @ V) @ numbers("origin", 3)), lens)

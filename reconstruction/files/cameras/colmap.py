@@ -1,7 +1,7 @@
 """COLMAP's sparse models, text and binary (colmap.github.io/format.html, cameras.html).
 
-Poses take the world to the camera, x right, y down, z forward; the corner of the top-left pixel is
-at (0, 0). A model has no unit of its own.
+Poses map world to camera, x right, y down, z forward; the corner of the top-left pixel is at (0,
+0). A model has no unit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MODELS = (
     *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4)),
     *(("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12)),
 )
-"""Names and counts of parameters, by COLMAP's number of the model."""
+"""Names and parameter counts, by COLMAP's model number."""
 _COUNTS = dict(MODELS)
 _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE")
 
@@ -52,9 +52,9 @@ class _Image:
 
 
 def read_colmap(folder: Path) -> CameraFile:
-    """The images of a model as cameras; `folder` holds cameras and images, `.txt` or `.bin`.
+    """The images of a model in `folder` (`.txt` or `.bin`) as cameras.
 
-    Raises `CameraFileError` naming file and line or byte.
+    Raises `CameraFileError` naming the file and the line or byte.
     """
     if (folder / "cameras.txt").is_file():
         lenses, images = _text_cameras(folder / "cameras.txt"), _text_images(folder / "images.txt")
@@ -62,7 +62,7 @@ def read_colmap(folder: Path) -> CameraFile:
         lenses = _binary_cameras(folder / "cameras.bin")
         images = list(_binary_images(folder / "images.bin"))
     if not images:
-        raise CameraFileError(f"{folder}: the model has no image: nothing was registered")
+        raise CameraFileError(f"{folder}: the model has no registered image")
     cameras = []
     for image, name in zip(
         images, camera_names([i.name for i in images], str(folder)), strict=True
@@ -86,7 +86,7 @@ def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[floa
         )
     if model in ("FOV", "THIN_PRISM_FISHEYE"):
         raise CameraFileError(
-            f"{where}: {model} is no lens of OpenCV's: undistort the pictures with "
+            f"{where}: OpenCV has no lens model {model}: undistort the images with "
             "`colmap image_undistorter` and import its model"
         )
     if not np.isfinite(params).all():
@@ -99,13 +99,13 @@ def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[floa
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Where each line is, and its words; comments are left out, blank lines are not."""
+    """Position and words of each line without comments; blank lines are kept."""
     try:
         text = plain_file(path).read_text()
     except FileNotFoundError:
-        raise CameraFileError(f"{path}: no such file; a COLMAP model has it") from None
+        raise CameraFileError(f"{path}: no such file; a COLMAP model needs it") from None
     except UnicodeDecodeError as error:
-        raise CameraFileError(f"{path}: no text ({error})") from error
+        raise CameraFileError(f"{path}: not text ({error})") from error
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#"):
             yield f"{path}, line {number}", line.split()
@@ -139,7 +139,7 @@ def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
 
 
 def _text_images(path: Path) -> list[_Image]:
-    """Every other line: an image, then its points, a line that may be blank."""
+    """Alternating lines: an image, then its points, possibly blank."""
     out = []
     lines = _lines(path)
     for where, words in lines:
@@ -158,13 +158,13 @@ def _text_images(path: Path) -> list[_Image]:
 
 
 class _Bytes:
-    """A binary file that is never believed beyond its end."""
+    """A binary file with bounds checks."""
 
     def __init__(self, path: Path) -> None:
         try:
             self.path, self.data, self.at = path, plain_file(path).read_bytes(), 0
         except FileNotFoundError:
-            raise CameraFileError(f"{path}: no such file; a COLMAP model has it") from None
+            raise CameraFileError(f"{path}: no such file; a COLMAP model needs it") from None
 
     def take(self, layout: str) -> tuple[float, ...]:
         size = struct.calcsize("<" + layout)
@@ -174,8 +174,8 @@ class _Bytes:
     def skip(self, size: int) -> None:
         if self.at + size > len(self.data):
             raise CameraFileError(
-                f"{self.path}: ends at byte {len(self.data):,}, where byte {self.at:,} announces "
-                f"{size:,} more: it is cut off, or no COLMAP model"
+                f"{self.path}: ends at byte {len(self.data):,}, expected {size:,} bytes at byte "
+                f"{self.at:,}: it is truncated, or not a COLMAP model"
             )
         self.at += size
 

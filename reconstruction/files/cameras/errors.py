@@ -1,4 +1,4 @@
-"""What is wrong with a file of cameras, what there is to be said of one, and names for cameras."""
+"""Results and errors of camera files, and names for cameras."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ CameraAxes = Literal["opencv", "opengl"]
 
 
 class CameraFileError(ValueError):
-    """A file of cameras that cannot be used; the message names it, the place and what to do."""
+    """An invalid camera file; the message names the file, the position and what to do."""
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Cameras as a file has them, in its own units and axes of the world; `notes` for its user.
+    """Cameras in the file's unit and world axes; `notes` are for the user.
 
-    `metres` is the length of its unit where the file says so, else None; `unitless` where its kind
-    has none of its own. `axes` are those in which it was read to give its cameras' poses.
+    `metres` is the length of its unit, None if unknown; `unitless` if the format has no unit.
+    `axes` are the camera axes of the file.
     """
 
     cameras: list[Camera]
@@ -39,10 +39,10 @@ class CameraFile:
 
 
 def camera_names(pictures: Sequence[str], where: str) -> list[str]:
-    """What the cameras of `pictures` (paths) are called: the file's stem where all differ.
+    """Camera names from image paths: the stems if all differ.
 
-    Else the innermost folder in which all differ, as in `cam_03/all_on.png`. Raises
-    `CameraFileError` where nothing tells them apart, or what does is no file's name.
+    Else the innermost folders that all differ, as in `cam_03/all_on.png`. Raises `CameraFileError`
+    if there are none, or they are not valid file names.
     """
     paths = [PurePosixPath(p.replace("\\", "/")) for p in pictures]
     depth = max((len(p.parts) for p in paths), default=0)
@@ -51,21 +51,21 @@ def camera_names(pictures: Sequence[str], where: str) -> list[str]:
         if len(set(names)) == len(names):
             for name in names:
                 if not is_file_name(name):
-                    raise CameraFileError(f"{where}: {name!r} cannot be a camera's name")
+                    raise CameraFileError(f"{where}: {name!r} is not a valid name")
             return names
     twice = Counter(str(p) for p in paths).most_common(1)[0][0] if paths else ""
-    raise CameraFileError(f"{where}: no part of the pictures' names differs for all, as of {twice}")
+    raise CameraFileError(f"{where}: image names do not identify cameras: {twice} occurs twice")
 
 
 def pinhole_K(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
-    """K `(3, 3)` of our convention from a principal point that counts from the picture's corner."""
+    """K `(3, 3)` with pixel centres at integers, from a principal point relative to the corner."""
     return np.array([[fx, skew, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]])
 
 
 def camera_of(
     where: str, name: str, size: tuple[int, int], K: Any, pose: tuple[Any, Any], lens: LensModel
 ) -> Camera:
-    """A `Camera` where that can carry the lens, else a `LensModelCamera`.
+    """A `Camera` if it can represent the lens, else a `LensModelCamera`.
 
     `size` is (width, height), `pose` (R, t). Raises `CameraFileError`.
     """
@@ -79,7 +79,7 @@ def camera_of(
 
 
 def _plain(lens: LensModel) -> Array | None:
-    """OpenCV's k1, k2, p1, p2, k3, where the lens has no more."""
+    """OpenCV's k1, k2, p1, p2, k3 if the lens has no further coefficients."""
     k = lens.coefficients
     if lens.kind == "opencv" and not k[5:].any():
         return k[:5]

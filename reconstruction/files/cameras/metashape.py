@@ -1,8 +1,8 @@
 """Metashape's exported cameras, `.xml` (Metashape manual, "Camera models"; Export Cameras).
 
-A camera's transform takes it to the chunk, x right, y down, z forward; the component's, or the
-chunk's, takes that to the world: X = scale · R x + t. The corner of the top-left pixel is at
-(0, 0); cx and cy count from the picture's middle.
+A camera's transform maps camera (x right, y down, z forward) to chunk; the component's or the
+chunk's maps that to the world: X = scale · R x + t. The corner of the top-left pixel is at (0, 0);
+cx and cy are relative to the image centre.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ _UNIT = re.compile(r'UNIT\["([^"]*)",\s*([0-9.eE+-]+)\s*\]')
 
 
 def read_metashape(path: Path, root: Element) -> CameraFile:
-    """The cameras of the (one) chunk that Metashape has aligned; of others `notes` tell.
+    """The aligned cameras of the only chunk; `notes` list the others.
 
     Raises `CameraFileError` naming the element.
     """
     chunks = root.findall("chunk") or ([root] if root.tag == "chunk" else [])
     if len(chunks) != 1:
-        raise CameraFileError(f"{path}: expected one chunk, got {len(chunks)}: export one alone")
+        raise CameraFileError(
+            f"{path}: expected one chunk, got {len(chunks)}: export a single chunk"
+        )
     chunk = chunks[0]
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
     components = {c.get("id"): c.find("transform") for c in chunk.iterfind("components/component")}
@@ -47,9 +49,11 @@ def read_metashape(path: Path, root: Element) -> CameraFile:
     posed = [c for c in entries if c.find("transform") is not None]
     absent = [c.get("label", "?") for c in entries if c.find("transform") is None]
     if not posed:
-        raise CameraFileError(f"{path}: no camera is aligned (has a transform): align them first")
+        raise CameraFileError(
+            f"{path}: no camera is aligned (has a transform): align cameras first"
+        )
     if absent:
-        notes.append(f"{path}: not aligned, left out: {', '.join(absent)}")
+        notes.append(f"{path}: not aligned, skipped: {', '.join(absent)}")
     names = camera_names([c.get("label", "") for c in posed], str(path))
     cameras = []
     scaled = False
@@ -71,15 +75,15 @@ def _unit(path: Path, chunk: Element) -> tuple[list[str], float | None]:
     reference = chunk.findtext("reference", "")
     if reference.startswith(("GEOGCS", "GEOCCS", "PROJCS")):
         raise CameraFileError(
-            f"{path}: its world is on the globe ({reference[:40]}…): export in local coordinates"
+            f"{path}: geographic coordinates ({reference[:40]}…): export in local coordinates"
         )
     found = _UNIT.search(reference)
     if not found:
         return [], None
     name, value = found[1].lower(), float(found[2])
-    if name.startswith("milli") and value == 1:  # as scripts write it that multiply by 1000
+    if name.startswith("milli") and value == 1:  # of scripts that scale by 1000
         value = 0.001
-    return [f"{path}: its reference counts in {found[1]}"], value
+    return [f"{path}: unit of the reference: {found[1]}"], value
 
 
 def _numbers(text: str | None, count: int, where: str) -> Array:
@@ -112,14 +116,14 @@ def _camera(
         raise CameraFileError(f"{where}: its sensor has no calibration")
     kind = calibration.get("type", sensor.get("type", "frame"))
     if kind not in ("frame", "equidistant_fisheye", "fisheye"):
-        raise CameraFileError(f"{where}: a {kind} camera is not read; frame and fisheye are")
+        raise CameraFileError(f"{where}: expected a frame or fisheye camera, got {kind}")
     size = _size(where, calibration, sensor)
     f, b1, b2 = (_value(calibration, t, where, d) for t, d in (("f", None), ("b1", 0), ("b2", 0)))
     cx = _value(calibration, "cx", where) + size[0] / 2
     cy = _value(calibration, "cy", where) + size[1] / 2
     fisheye = kind != "frame"
     if fisheye and (any(_value(calibration, t, where) for t in ("p1", "p2"))):
-        raise CameraFileError(f"{where}: a fisheye with p1, p2 is not read: fix them to 0")
+        raise CameraFileError(f"{where}: a fisheye with p1, p2 is not supported: fix them to 0")
     values = [_value(calibration, t, where) for t in (_FISHEYE if fisheye else _LENS)]
     lens = LensModel("fisheye" if fisheye else "metashape", np.array(values))
     pose = _numbers(element.findtext("transform"), 16, f"{where}: <transform>").reshape(4, 4)

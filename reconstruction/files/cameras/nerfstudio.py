@@ -1,6 +1,6 @@
-"""`transforms.json` as nerfstudio, Instant NGP and Blender's NeRF scenes write it.
+"""`transforms.json` of nerfstudio, Instant NGP and Blender's NeRF scenes.
 
-`transform_matrix` takes the camera to the world, x right, y up, z backwards; the corner of the
+`transform_matrix` maps camera to world, x right, y up, z backwards; the corner of the
 top-left pixel is at (0, 0) (docs.nerf.studio, "Data conventions", its ray generator and
 `camera_utils._compute_residual_and_jacobian`).
 """
@@ -32,7 +32,7 @@ _PLAIN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PER
 
 
 def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
-    """Cameras of a `transforms.json`; frames of one pose and lens (one for each light) are one.
+    """Cameras of a `transforms.json`; frames with the same pose and lens are one camera.
 
     Raises `CameraFileError` naming the frame and the field.
     """
@@ -49,9 +49,7 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
         key = matrix.tobytes() + repr(lens).encode()
         picture = frame.get("file_path")
         if not isinstance(picture, str) or not picture:
-            raise CameraFileError(
-                f"{where}.file_path: expected the picture's path, got {picture!r}"
-            )
+            raise CameraFileError(f"{where}.file_path: expected an image path, got {picture!r}")
         groups.setdefault(key, []).append(picture)
         found.setdefault(key, (where, fields, matrix))
     shared = [_shared(pictures) for pictures in groups.values()]
@@ -64,7 +62,7 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
 
 
 def _shared(pictures: list[str]) -> str:
-    """One picture's path, or what the paths of one camera's pictures have in common."""
+    """An image path, or the common path of a camera's images."""
     if len(pictures) == 1:
         return pictures[0]
     parts = [PurePosixPath(p).parts for p in pictures]
@@ -96,7 +94,7 @@ def _number(fields: dict[str, Any], name: str, where: str, default: float | None
 
 
 def _size(path: Path, picture: str, fields: dict[str, Any], where: str) -> tuple[int, int]:
-    """Width and height from the file, else of the picture itself."""
+    """Width and height from the file, else from the image."""
     if "w" in fields and "h" in fields:
         return int(_number(fields, "w", where)), int(_number(fields, "h", where))
     for suffix in ("", ".png", ".jpg", ".exr"):
@@ -104,8 +102,7 @@ def _size(path: Path, picture: str, fields: dict[str, Any], where: str) -> tuple
         if there.is_file():
             return picture_size(there)
     raise CameraFileError(
-        f"{where}: neither the fields 'w' and 'h' nor a picture {picture} say how large it is: "
-        "add w and h"
+        f"{where}: unknown image size: add the fields 'w' and 'h', or the image {picture}"
     )
 
 
@@ -115,7 +112,7 @@ def _camera(
     model = fields.get("camera_model", "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True
     if not fisheye and model not in _PLAIN:
-        raise CameraFileError(f"{where}: camera_model {model!r} is neither OPENCV nor a fisheye")
+        raise CameraFileError(f"{where}: expected camera_model OPENCV or a fisheye, got {model!r}")
     size = width, height = _size(path, picture, fields, where)
     if "fl_x" in fields:
         fx = _number(fields, "fl_x", where)
@@ -134,8 +131,8 @@ def _camera(
 
 
 def _lens(fields: dict[str, Any], fisheye: bool, where: str) -> LensModel:
-    """nerfstudio's k4 goes with r⁸, as Metashape's does, whose p1 and p2 are exchanged; beside k5
-    or k6 it is OpenCV's, as of COLMAP's FULL_OPENCV."""
+    """nerfstudio's k4 is the coefficient of r⁸, as Metashape's, whose p1 and p2 are exchanged; with
+    k5 or k6 it is OpenCV's (COLMAP's FULL_OPENCV)."""
 
     def numbers(*names: str) -> Array:
         return np.array([_number(fields, k, where, 0.0) for k in names])

@@ -1,9 +1,9 @@
-"""Calibrations that `cv::FileStorage` wrote (`.yml`, `.xml`, `.json`), and dictionaries like them.
+"""Calibrations of `cv::FileStorage` (`.yml`, `.xml`, `.json`) and similar JSON.
 
-One file for each camera in a folder, or one with a map for each camera. `K` or `camera_matrix`;
-`dist` or `distortion_coefficients` in OpenCV's order; `R` (a rotation or Rodrigues' vector) or
-`rvec`, and `T` or `tvec`, take the world to the camera; `pose` (4, 4) takes the camera to the
-world. The centre of the top-left pixel is at (0, 0).
+One file per camera in a folder, or one with a map per camera. `K` or `camera_matrix`; `dist` or
+`distortion_coefficients` in OpenCV's order; `R` (a rotation or Rodrigues vector) or `rvec`, and `T`
+or `tvec`, map world to camera; `pose` (4, 4) maps camera to world. The centre of the top-left pixel
+is at (0, 0).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SUFFIXES = (".yml", ".yaml", ".xml")
 
 
 def read_opencv(path: Path) -> CameraFile:
-    """One camera, called after the file, or one for each map in it.
+    """One camera, named after the file, or one for each map in it.
 
     Raises `CameraFileError` naming the field.
     """
@@ -46,14 +46,14 @@ def read_opencv_folder(folder: Path, files: list[Path]) -> CameraFile:
 
 
 def cameras_from(path: Path, data: Mapping[str, Any]) -> CameraFile:
-    """The camera of `data`, called after the file, or one for each map in it, by its name."""
+    """The camera of `data`, named after the file, or one for each map in it."""
     if any(k in data for k in _K):
         return CameraFile([camera_from(str(path), path.stem, data)])
     maps = {k: v for k, v in data.items() if isinstance(v, Mapping) and any(f in v for f in _K)}
     if not maps:
-        raise CameraFileError(f"{path}: neither it nor a map in it has one of {', '.join(_K)}")
+        raise CameraFileError(f"{path}: expected one of {', '.join(_K)} in it or in a map")
     left = [k for k, v in data.items() if isinstance(v, Mapping) and k not in maps]
-    notes = [f"{path}: left out, as none of {', '.join(_K)} is there: {', '.join(left)}"]
+    notes = [f"{path}: skipped, without any of {', '.join(_K)}: {', '.join(left)}"]
     cameras = [camera_from(f"{path}: {name}", name, table) for name, table in maps.items()]
     return CameraFile(cameras, notes if left else [])
 
@@ -61,7 +61,7 @@ def cameras_from(path: Path, data: Mapping[str, Any]) -> CameraFile:
 def camera_from(where: str, name: str, table: Mapping[str, Any]) -> Camera:
     """A camera from a map's fields."""
     if not is_file_name(name):
-        raise CameraFileError(f"{where}: {name!r} cannot be a camera's name")
+        raise CameraFileError(f"{where}: {name!r} is not a valid name")
     K = _array(where, table, _K, ((3, 3),))
     size = _size(where, table)
     dist = _array(where, table, _DIST, None) if any(f in table for f in _DIST) else np.zeros(0)
@@ -77,7 +77,7 @@ def _pose(where: str, table: Mapping[str, Any]) -> tuple[Array, Array]:
         return R, -R @ pose[:3, 3]
     if not any(f in table for f in _R) or not any(f in table for f in _T):
         raise CameraFileError(
-            f"{where}: has no pose: R (or rvec) and T (or tvec) must take the world to the camera"
+            f"{where}: no pose: give R (or rvec) and T (or tvec), world to camera"
         )
     R = _array(where, table, _R, ((3, 3), (3, 1), (1, 3), (3,)))
     if R.size == 3:
@@ -106,12 +106,12 @@ def _array(
 ) -> Array:
     name = next((n for n in names if n in table), None)
     if name is None:
-        raise CameraFileError(f"{where}: has none of {', '.join(names)}")
-    said = table[name]
+        raise CameraFileError(f"{where}: expected one of {', '.join(names)}")
+    given = table[name]
     try:
-        if isinstance(said, Mapping):  # as OpenCV writes matrices in JSON
-            said = np.reshape(said["data"], (said["rows"], said["cols"]))
-        value = np.array(said, dtype=np.float64)
+        if isinstance(given, Mapping):  # OpenCV's JSON
+            given = np.reshape(given["data"], (given["rows"], given["cols"]))
+        value = np.array(given, dtype=np.float64)
     except (TypeError, ValueError, LookupError):
         value = np.full(1, np.nan)
     if (shapes and value.shape not in shapes) or not np.isfinite(value).all():
@@ -121,7 +121,7 @@ def _array(
 
 
 def _storage(path: Path) -> dict[str, Any]:
-    """What a file of `cv::FileStorage` holds."""
+    """The content of a `cv::FileStorage` file."""
     storage = None
     try:
         storage = cv2.FileStorage(str(plain_file(path)), cv2.FILE_STORAGE_READ)
@@ -138,7 +138,7 @@ def _storage(path: Path) -> dict[str, Any]:
 
 
 def _matrix(node: Any) -> Any:
-    """A matrix from its numbers: OpenCV's own reader ends the process where they are too few."""
+    """A matrix from its numbers: OpenCV's own reader aborts the process if there are too few."""
     keys = node.keys()
     sizes = _node(node.getNode("sizes"), 8) if "sizes" in keys else None
     shape = sizes or [node.getNode(k).real() for k in ("rows", "cols")]

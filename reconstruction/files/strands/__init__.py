@@ -4,9 +4,8 @@ Alembic curves out.
     strands = read_strands("groom.hair")
     write_strands("groom.usdc", strands)
 
-The suffix says the format. The readers say what is wrong with a file, `read_strands` which it is,
-and none trusts a header: what it claims is held against the file's size before anything is
-allocated.
+The suffix determines the format. Readers check the header against the file's size before any
+allocation.
 """
 
 from __future__ import annotations
@@ -54,11 +53,10 @@ _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
     """Read strands from a file of any of the formats `READABLE`, root first.
 
-    Only USD says which way is up and what its unit is, and comes out in metres with z up whatever
-    `up_axis` is. The others are read as metres, and `up_axis="y"` turns a y-up file so that z is up
-    ((x, y, z) becomes (x, -z, y)).
+    USD is converted to metres with z up, whatever `up_axis` is. Other formats are read as metres;
+    `up_axis="y"` converts y up to z up, (x, y, z) to (x, -z, y).
 
-    Raises `StrandFileError` (a `ValueError`) naming the file and what is wrong with it.
+    Raises `StrandFileError` (a `ValueError`) naming the file and the error.
     """
     path = Path(path)
     if up_axis not in ("z", "y"):
@@ -80,7 +78,7 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
 
 
 def read_poses(path: str | Path) -> list[Strands]:
-    """Read strands that move: an `.npz` of points (T, N, 3); one pose of any other file.
+    """Read animated strands: an `.npz` of points (T, N, 3), or one pose of any other file.
 
     Raises `StrandFileError` as `read_strands` does.
     """
@@ -98,9 +96,8 @@ def read_poses(path: str | Path) -> list[Strands]:
 def write_strands(path: str | Path, strands: Strands) -> None:
     """Write strands in the format that the suffix names (one of `WRITABLE`), in metres, z up.
 
-    Alembic alone is y up, as is its custom, and needs the extra `alembic`.
-    Written under a temporary name, flushed and renamed: afterwards the file is whole or not there.
-    Raises `StrandFileError` when the format is unknown or cannot hold these strands.
+    Alembic is y up, by custom, and needs the extra `alembic`. Writes are atomic. Raises
+    `StrandFileError` for an unknown format or strands that it cannot store.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())

@@ -1,8 +1,7 @@
-"""Alembic `.abc` curves, as output, through the extra `alembic` (alembic3d, PyAlembic's wheels).
+"""Writing Alembic `.abc` curves with the extra `alembic` (alembic3d, PyAlembic's wheels).
 
-Not as input: the library checks that a file is whole, but three in a hundred files with a few
-damaged bytes end the process instead of raising. Alembic knows neither axes nor unit; by custom y
-is up, and one unit is written a metre.
+Reading is not supported: damaged files can abort the process. Alembic has neither axes nor unit; by
+custom y is up, and one unit is a metre.
 """
 
 from __future__ import annotations
@@ -24,19 +23,18 @@ _Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 def write_abc(path: Path, strands: Strands) -> None:
     """Write one set of linear curves, `/hair`, y up; widths are twice the radius.
 
-    Raises `StrandFileError` where the extra is not installed.
+    Raises `StrandFileError` if the extra is not installed.
     """
     turned = strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3))
     write_archive(path, 20 * len(strands.points), lambda top: add_curves(top, "hair", turned))
 
 
 def write_archive(path: Path, needed: int, fill: Callable[[Any], Any]) -> None:
-    """Write an archive that `fill` puts into its top object; `path` is whole then or not there.
+    """Write an archive atomically; `fill` adds objects to its top object.
 
-    What `fill` makes it must not keep: the library completes the file when all of it is gone.
-    Raises `StrandFileError` where the extra is not installed or the file cannot be written, and
-    `DiskFull` where there is no room for `needed` bytes: the library, once it meets a full disk,
-    ends the process.
+    `fill` must not keep references: the library completes the file when all objects are freed.
+    Raises `StrandFileError` if the extra is missing or writing fails, and `DiskFull` without room
+    for `needed` bytes, since the library aborts the process on a full disk.
     """
     try:
         import imath  # noqa: F401
@@ -55,15 +53,14 @@ def write_archive(path: Path, needed: int, fill: Callable[[Any], Any]) -> None:
 
 
 def add_curves(top: Any, name: str, strands: Strands) -> Any:
-    """Add linear curves as they are, a width at each point; returns them, to add values to.
+    """Add linear curves with a width at each point; returns them, for `add_values`.
 
-    Readers go by more than the type: Blender makes Bézier curves without a radius of linear ones
-    whose basis is not said to be none, and takes no width that is one for all.
+    Blender needs the basis "none", or it makes Bézier curves, and a width per point.
     """
     import imath
     from alembic3d import AbcGeom
 
-    # A sample only points at its arrays: the names keep them alive until it is written.
+    # a sample references its arrays: these names keep them alive until it is written
     points = imath.V3fArrayFromBuffer(strands.points)
     counts = imath.IntArrayFromBuffer(np.diff(strands.offsets).astype(np.int32))
     width = 2 * np.asarray(strands.radius, np.float32)

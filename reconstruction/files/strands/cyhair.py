@@ -1,10 +1,9 @@
 """cyHair `.hair` files (Cem Yuksel, www.cemyuksel.com/research/hairmodels).
 
-A 128-byte little-endian header, then the arrays that its flags announce, in this order:
-segments per strand (uint16), points (3 float32), thickness, transparency (float32 per point) and
-colour (3 float32 per point). `thickness` is the width of a strand, twice the radius. Transparency
-and colour are checked for but not read: appearance has its own files. Both spellings of the magic
-that are about, "HAIR" and "hair", are read; "HAIR", the one of the specification, is written.
+A 128-byte little-endian header, then the arrays in its flags, in this order: segments per strand
+(uint16), points (3 float32), thickness, transparency (float32 per point) and colour (3 float32 per
+point). `thickness` is twice the radius. Transparency and colour are not read. The magics "HAIR" (of
+the specification) and "hair" are read, "HAIR" is written.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ INFORMATION = b"hairstage: metres, z up, roots first; thickness is twice the rad
 
 
 def read_hair(path: Path) -> Strands:
-    """Read a `.hair` file; strands without a segment (some grooms have them) are left out.
+    """Read a `.hair` file; strands without a segment are skipped.
 
-    A file without any thickness, or with one that is not positive, gets the default radius.
+    A missing or non-positive thickness becomes the default radius.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -75,7 +74,7 @@ def read_hair(path: Path) -> Strands:
 
 
 def _radius(width: np.ndarray) -> float | np.ndarray:
-    """Radii from widths: one number where all are the same, the default where they say nothing."""
+    """Radii from widths: a scalar if all are equal, the default if invalid."""
     if len(width) == 0 or not (np.isfinite(width).all() and (width > 0).all()):
         return 4e-5
     half = (width / 2).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The error of every strand file."""
+"""Errors of strand files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from reconstruction.arrays import Ints
 
 
 class StrandFileError(ValueError):
-    """A strand file that cannot be read or written; the message names the file and the reason."""
+    """A strand file that cannot be read or written; the message names file and reason."""
 
 
 def require_finite(points: NDArray[Any], byte_of: Ints | range) -> None:
-    """Raise `StrandFileError` where one of `points (N, 3)` is not finite.
+    """Raise `StrandFileError` if one of `points (N, 3)` is not finite.
 
-    `byte_of (N,)` says where in the file each point begins.
+    `byte_of (N,)` are the points' byte offsets in the file.
     """
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):

@@ -19,7 +19,7 @@ from reconstruction.geometry.strands import Strands
 
 
 def read_npz(path: Path) -> Strands:
-    """Read an archive; other members than those of the module's text are not looked at."""
+    """Read an archive; other members are ignored."""
     points, offsets, radius, confidence = _members(path)
     if points.ndim != 2 or points.shape[1] != 3:
         raise StrandFileError(f"points must be (N, 3), got {points.shape}")
@@ -27,7 +27,7 @@ def read_npz(path: Path) -> Strands:
 
 
 def read_npz_poses(path: Path) -> list[Strands]:
-    """Read the poses of an archive, one where its points are `(N, 3)`."""
+    """Read the poses of an archive, one for points `(N, 3)`."""
     points, offsets, radius, confidence = _members(path)
     if points.ndim == 2:
         points = points[None]
@@ -58,7 +58,7 @@ def _members(
 
 
 def write_npz(path: Path, strands: Strands) -> None:
-    """Write `points`, `offsets`, `radius` and, where it is known, `confidence`, uncompressed."""
+    """Write `points`, `offsets`, `radius` and, if known, `confidence`, uncompressed."""
     arrays: dict[str, NDArray[Any]] = {
         "points": strands.points,
         "offsets": strands.offsets,
@@ -66,5 +66,8 @@ def write_npz(path: Path, strands: Strands) -> None:
     }
     if strands.confidence is not None:
         arrays["confidence"] = strands.confidence
-    with writing(path) as temporary, temporary.open("wb") as file:  # a name gets ".npz" put behind
+    with (
+        writing(path) as temporary,
+        temporary.open("wb") as file,
+    ):  # for a name numpy appends ".npz"
         np.savez(file, allow_pickle=False, **arrays)

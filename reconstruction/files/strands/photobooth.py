@@ -1,5 +1,4 @@
-"""`.data` files, as input: the form in which Hair Photobooth published its hair and in which
-USC-HairSalon and its descendants are distributed.
+"""Reading `.data` files of Hair Photobooth and USC-HairSalon.
 
 Little-endian, no magic: the number of strands (int32); for each strand the number of its points
 (int32), then those points, root first, three float32 each. USC-HairSalon stores a root without hair
@@ -18,9 +17,9 @@ from reconstruction.geometry.strands import Strands
 
 
 def read_data(path: Path) -> Strands:
-    """Read a `.data` file, in its own frame and unit; strands of under two points are left out.
+    """Read a `.data` file in its frame and unit; strands of under two points are skipped.
 
-    The counts must use up the file exactly: there is nothing else to tell it from any other bytes.
+    The counts must match the file size exactly, as the format has no magic.
     """
     raw = path.read_bytes()
     if len(raw) < 4:

@@ -1,7 +1,7 @@
-"""AMD TressFX `.tfx` files, versions 3 and 4, as input.
+"""Reading AMD TressFX `.tfx` files, versions 3 and 4.
 
-All little-endian, every strand with the same number of vertices, byte offsets from the start of the
-file, 0 for what is not there.
+Little-endian, the same number of vertices per strand, byte offsets from the start of the file, 0 if
+absent.
 
 Version 4, 160 bytes: version (float32), strands, vertices per strand, then the offsets of vertex
 positions, strand UVs, vertex UVs, thickness and colour, and 32 reserved words. Positions are four
@@ -10,9 +10,8 @@ float32 a vertex: x, y, z and the inverse mass.
 Version 3, 296 bytes: version (float32), strands, vertices per strand, followers per strand, whether
 both ends are held, 31 reserved words, then the offsets of vertex positions, thickness, strand UVs,
 colour, guide indices and vertex UVs, and 32 reserved words. Positions are three float32 a vertex.
-Followers are not in the file: TressFX makes them up around its strands when it draws.
 
-Only positions are read.
+Only positions are read; followers are not in the file.
 """
 
 from __future__ import annotations

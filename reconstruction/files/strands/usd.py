@@ -1,11 +1,9 @@
 """USD `BasisCurves` through `usd-core`.
 
-Linear curves are written: `curveVertexCounts`, `points`, `widths` (twice the radius) and, where it
-is known, the primvar `confidence` of every point, z up, one unit a metre. Every linear
-`BasisCurves` of a stage is read, but for those whose purpose is "guide", in the world's frame,
-turned to z up and scaled to metres by what the stage says of itself; `confidence` is not. Cubic
-curves are refused: taking their control points for points on the hair would be wrong by up to a
-control segment.
+Written are linear curves with `curveVertexCounts`, `points`, `widths` (twice the radius) and, if
+known, the primvar `confidence` per point, z up, in metres. Read are all linear `BasisCurves` of a
+stage, except those with purpose "guide", in the world frame, converted to z up and metres.
+Cubic curves are refused: their control points are not on the hair.
 """
 
 from __future__ import annotations
@@ -22,15 +20,15 @@ from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.geometry.strands import Strands
 
 _START = Usd.TimeCode.EarliestTime()
-"""The first of an attribute's times, or its only value: many programs write times alone."""
+"""The first time sample, or the only value: many programs write time samples only."""
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def read_usd(path: Path) -> Strands:
-    """Read all linear `BasisCurves` of a stage in metres with z up; of an animation its start."""
+    """Read all linear `BasisCurves` of a stage, metres, z up, at the start of an animation."""
     try:
         return _read(Usd.Stage.Open(str(path)))
-    except Tf.ErrorException as error:  # also of values, which are read when they are asked for
+    except Tf.ErrorException as error:  # also of values, which are read lazily
         raise StrandFileError(f"cannot be read as USD ({_first_line(error)})") from error
 
 
@@ -39,7 +37,7 @@ def _read(stage: Any) -> Strands:
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
         turn = _Y_UP_TO_Z_UP @ turn
     cache = UsdGeom.XformCache(_START)
-    prims = stage.Traverse(Usd.TraverseInstanceProxies())  # what instances share is hair, too
+    prims = stage.Traverse(Usd.TraverseInstanceProxies())  # includes instances
     curves = (UsdGeom.BasisCurves(prim) for prim in prims)
     hair = (c.GetPrim() for c in curves if c and c.ComputePurpose() != UsdGeom.Tokens.guide)
     found = [_curves(prim, cache, turn) for prim in hair]
@@ -58,9 +56,9 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     curves = UsdGeom.BasisCurves(prim)
     where = prim.GetPath()
     if curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear:
-        raise StrandFileError(f"{where}: only linear curves can be read; convert the cubic ones")
+        raise StrandFileError(f"{where}: only linear curves are supported; convert cubic ones")
     if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
-        raise StrandFileError(f"{where}: closed (periodic) curves are no strands")
+        raise StrandFileError(f"{where}: closed (periodic) curves are not strands")
     points = np.asarray(curves.GetPointsAttr().Get(_START) or [], np.float64).reshape(-1, 3)
     counts = np.asarray(curves.GetCurveVertexCountsAttr().Get(_START) or [], np.int64)
     if (counts < 2).any() or counts.sum() != len(points):
@@ -86,8 +84,8 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     thin = int((~(widths > 0)).sum())
     if thin:
         raise StrandFileError(
-            f"{where}: {thin} of {len(widths)} widths are not above 0: give strands a width up to "
-            "their tips"
+            f"{where}: {thin} of {len(widths)} widths are not above 0: give strands a width at all "
+            "points"
         )
     return world.astype(np.float32), counts, (widths / 2).astype(np.float32)
 
@@ -100,7 +98,7 @@ def write_usd(path: Path, strands: Strands) -> None:
 
 
 def new_stage(up: Any) -> Any:
-    """An empty stage in metres whose axis `up`, "Y" or "Z", points upwards."""
+    """An empty stage in metres with up axis `up`, "Y" or "Z"."""
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, up)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -108,7 +106,7 @@ def new_stage(up: Any) -> Any:
 
 
 def define_curves(stage: Any, where: str, strands: Strands) -> Any:
-    """Linear `BasisCurves` at the path `where`, their widths and their extent."""
+    """Linear `BasisCurves` at the path `where`, with widths and extent."""
     curves = UsdGeom.BasisCurves.Define(stage, where)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
     curves.CreateWrapAttr(UsdGeom.Tokens.nonperiodic)
@@ -134,7 +132,7 @@ def define_curves(stage: Any, where: str, strands: Strands) -> Any:
 
 
 def save_stage(stage: Any, path: Path) -> None:
-    """Write a stage, whole or not at all. Raises `StrandFileError` naming the file."""
+    """Write a stage atomically. Raises `StrandFileError`."""
     try:
         with writing(path) as temporary:
             stage.GetRootLayer().Export(str(temporary))

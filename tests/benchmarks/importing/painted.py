@@ -11,7 +11,7 @@ import numpy as np
 
 from reconstruction import Camera, Capture, Mesh, Projector, Rig, Step, Strands, write_obj
 from reconstruction.arrays import Array, Floats, Ints
-from reconstruction.capture.folder import FrameRecord
+from reconstruction.capture.records import FrameRecord
 from reconstruction.files.durable import write_json
 from reconstruction.geometry.mesh_queries import mesh_depth
 from simulators.subject.subject import make_subject

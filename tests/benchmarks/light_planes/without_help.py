@@ -19,7 +19,7 @@ from reconstruction import Capture, Projector, Rig, Step
 from reconstruction.calibration.boards import Board
 from reconstruction.calibration.rig_comparison import aligned, compare_rigs
 from reconstruction.calibration.solve import TargetCaptures, Targets, calibrate
-from reconstruction.capture.folder import StepKind
+from reconstruction.capture.records import StepKind
 from simulators.subject.props import SPHERES, PropResponder, SphereProp, board_pose
 
 POSES = range(32)

@@ -66,7 +66,7 @@ def test_missing_frames_say_why(capture):
     assert not capture.has(STEPS[-1], "cam_0")
     with pytest.raises(MissingFrame, match=r"step 5 \(scanline\), cam_0: the camera was mute"):
         capture.frame(STEPS[-1], "cam_0")
-    with pytest.raises(MissingFrame, match=r"no frame for the lights \['light_1'\]"):
+    with pytest.raises(MissingFrame, match=r"no single-light frames of \['light_1'\]"):
         capture.olat("cam_0", ["light_0", "light_1"])
 
 

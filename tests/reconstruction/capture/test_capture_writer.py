@@ -130,9 +130,11 @@ def test_a_crash_in_the_journal_costs_the_torn_line_alone(tmp_path):
     journal.write_bytes(journal.read_bytes()[:-20])
     assert len(Capture(tmp_path / "c").records) == 3
     problems = verify(tmp_path / "c")
-    assert problems[0].startswith("journal.jsonl ends in a torn line")
+    assert problems[0].startswith("journal.jsonl ends in an incomplete line")
     assert problems[1] == "manifest.json is missing: the capture was not finished."
-    assert problems[2] == ("3 planned frames were never shot; the first is step 1 (olat), cam_1.")
+    assert problems[2] == (
+        "3 planned frames were never captured; the first is step 1 (olat), cam_1."
+    )
     again = CaptureWriter.reopen(tmp_path / "c")
     assert again.missing() == [(STEPS[i], c) for i, c in EVERY[3:]]
     write(again, *EVERY[3:])
@@ -286,7 +288,7 @@ def test_what_a_crash_leaves_between_journal_and_removal_is_told_and_taken_away(
     old.write_bytes(before)
     (path / "frames/00002/.part-cam_1.zip.exr").write_bytes(b"half")
     (problem,) = verify(path)
-    assert problem.startswith("2 files among the frames are in no line of the journal")
+    assert problem.startswith("2 files under frames/ are not listed in the journal")
     assert problem.endswith("the first is frames/00001/cam_0.exr.")
     (path / "frames/00002/.part-cam_1.zip.exr").unlink()
     compress(path)
@@ -302,7 +304,7 @@ def test_verify_during_a_compression_finds_nothing_wrong(path):
 
 def test_a_capture_has_one_writer(tmp_path):
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
-    with pytest.raises(CaptureError, match="it is being written or compressed; wait for that"):
+    with pytest.raises(CaptureError, match="it is being written or compressed"):
         CaptureWriter.reopen(tmp_path / "c")
     write(writer, *EVERY)
     writer.close()
@@ -317,7 +319,7 @@ def test_stored_frames_count_only_once_they_are_committed(tmp_path):
     assert not list((tmp_path / "c").glob("frames/*/cam_?.exr"))
     writer.commit(records[:3])
     assert verify(tmp_path / "c")[1:] == [
-        "3 planned frames were never shot; the first is step 1 (olat), cam_1."
+        "3 planned frames were never captured; the first is step 1 (olat), cam_1."
     ]
     writer.close()
     assert len(list((tmp_path / "c").glob("frames/*/*"))) == 3
@@ -389,9 +391,9 @@ def test_a_killed_writer_costs_the_frame_under_way(tmp_path):
     subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
     assert verify(path) == [
         "manifest.json is missing: the capture was not finished.",
-        "3 planned frames were never shot; the first is step 1 (olat), cam_1.",
-        "1 files among the frames are in no line of the journal, left by a write or a compression "
-        "that was interrupted; the first is frames/00001/.part-cam_1.exr.",
+        "3 planned frames were never captured; the first is step 1 (olat), cam_1.",
+        "1 files under frames/ are not listed in the journal, as after an interrupted write or "
+        "compression; the first is frames/00001/.part-cam_1.exr.",
     ]
     again = CaptureWriter.reopen(path)
     write(again, *EVERY[3:])
@@ -430,7 +432,7 @@ def test_a_frame_that_finds_the_disk_full_is_an_error_and_no_frame(tmp_path):
     assert manifest["frames"] == {"planned": 6, "written": 1, "missing": 5}
     assert verify(tmp_path / "c") == [
         "The capture's outcome is 'failed', not 'completed'.",
-        "5 planned frames were never shot; the first is step 0 (dark), cam_1.",
+        "5 planned frames were never captured; the first is step 0 (dark), cam_1.",
     ]
 
 
@@ -459,7 +461,7 @@ def test_the_reserve_stays_free(tmp_path):
 def test_bad_input_is_named(tmp_path):
     with pytest.raises(CaptureError, match="'steps' is missing"):
         CaptureWriter.create(tmp_path / "a", RIG, {})
-    with pytest.raises(CaptureError, match=r"distinct, twice: \[1\]"):
+    with pytest.raises(CaptureError, match=r"duplicate step indices \[1\]"):
         CaptureWriter.create(tmp_path / "a", RIG, {"steps": [STEPS[1], STEPS[1]]})
     with pytest.raises(CaptureError, match="mask of cam_0: expected shape"):
         CaptureWriter.create(

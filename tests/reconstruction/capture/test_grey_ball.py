@@ -101,7 +101,7 @@ def test_radiance_is_the_balls(folder, tmp_path):
     said = capture.plan["import"]
     assert not said["relative"]
     (note,) = said["notes"]
-    assert note.startswith("grey ball: 30 mm in radius at (0.060, 0.020, -0.010) m")
+    assert note.startswith("grey ball: radius 30 mm at (0.060, 0.020, -0.010) m")
 
 
 def test_a_light_that_something_stands_before_changes_nothing(folder, tmp_path):
@@ -123,17 +123,17 @@ def test_lights_that_disagree_and_a_coloured_ball_are_told(folder, tmp_path):
     notes = import_folder(folder, tmp_path / "out").plan["import"]["notes"]
     assert DISAGREE < 0.5
     assert any("frames disagree by" in n for n in notes)
-    assert any("looks coloured" in n and n.count("1.") == 1 for n in notes), notes
+    assert any("images are coloured" in n and n.count("1.") == 1 for n in notes), notes
 
 
 @pytest.mark.parametrize(
     ("change", "more", "words"),
     [
-        ({"left": [30.0, 90.0, 8.0]}, "", "circles: the one of .* passes the others' ball by"),
-        ({"back": [60.0, 60.0, 8.0]}, "", "circles: there is no camera 'back'"),
+        ({"left": [30.0, 90.0, 8.0]}, "", "circles: the ray of .* misses the ball by"),
+        ({"back": [60.0, 60.0, 8.0]}, "", "circles: no camera 'back'"),
         ({"left": None, "top": None}, "", "outline in two cameras or more"),
         ({"left": [60.0, 60.0, -8.0]}, "", "a positive radius"),
-        ({}, "scale = 2.0", "stands for `scale`"),
+        ({}, "scale = 2.0", "remove `units` and `scale`"),
     ],
 )
 def test_what_does_not_fit_is_told(folder, tmp_path, change, more, words):

@@ -128,7 +128,7 @@ def test_becomes_a_capture(folder: Path, tmp_path: Path) -> None:
             lambda d: d["cameras"][0].update(K=[[100, 0, 7], [0, 100, 5], [0, 0, 2]]),
             r"cameras\[0\]: cam_00: K must be .* or scaled",
         ),
-        ("cameras.json", lambda d: d["cameras"][1].update(id=0), r"cameras\[1\]\.id: 0 is there"),
+        ("cameras.json", lambda d: d["cameras"][1].update(id=0), r"cameras\[1\]\.id: duplicate 0"),
         (
             "cameras.json",
             lambda d: d["cameras"][1].update(id="../x"),
@@ -197,7 +197,7 @@ def test_what_does_not_count_in_metres_is_named(folder: Path, tmp_path: Path) ->
     """Files of our own layout have no unit that an option could give."""
 
     def refused(words: str) -> None:
-        with pytest.raises(ImportProblem, match=f"{words}.*must be metres, with z up"):
+        with pytest.raises(ImportProblem, match=f"{words}.*give metres with z up"):
             import_folder(folder, tmp_path / "out")
 
     def scaled(kind: str, field: str, by: float) -> None:
@@ -213,10 +213,10 @@ def test_what_does_not_count_in_metres_is_named(folder: Path, tmp_path: Path) ->
 
     edit(folder / "cameras.json", turned)  # both look at the origin
     scaled("cameras", "t", 1000)
-    refused(r"cameras\.json: the cameras stand 1\.5 km from what the cameras look at")
+    refused(r"cameras\.json: the cameras are 1\.5 km from the point")
     scaled("cameras", "t", 1e-3)
     scaled("lights", "position", 1000)
-    refused(r"lights\.json: the lights stand 1 km")
+    refused(r"lights\.json: the lights are 1 km")
     scaled("lights", "position", 1e-3)
     corners = "v 0 0 0\nv 180 0 0\nv 0 230 0\n"
     (folder / "head.obj").write_text(corners + "f 1 2 3\n")
@@ -242,7 +242,7 @@ def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
         cameras=sparse, lights=folder / "lights.json", light_distance=1.5, placement=where
     )
     geometry = read_geometry(files)
-    assert f"{sparse} has no unit of its own: taken as mm (--unit)" in geometry.notes
+    assert f"{sparse} has no unit: mm is assumed (--unit)" in geometry.notes
     capture = import_folder(folder, tmp_path / "out", geometry=geometry)
     first, left = capture.rig.cameras
     assert [first.name, left.name] == list(CAMERAS)
@@ -304,5 +304,5 @@ def test_a_capture_rendered_by_cycles(shared_data: Callable[[str], Path], tmp_pa
 
 
 def test_lights_without_cameras_are_not_left_unread(folder: Path) -> None:
-    with pytest.raises(PlacementError, match="--lights goes with --cameras"):
+    with pytest.raises(PlacementError, match="--lights requires --cameras"):
         read_geometry(GeometryFiles(lights=folder / "lights.json"))

@@ -14,7 +14,7 @@ import pytest
 
 from reconstruction import Camera, Capture, CaptureError, Light, Model, Step
 from reconstruction.arrays import Floats
-from reconstruction.capture.kept_frames import frames_kept, kept_bytes
+from reconstruction.capture.frame_cache import cache_bytes, cached_frames
 from reconstruction.geometry.blocks import block_means
 from reconstruction.geometry.lens import Lens
 from reconstruction.images.silhouettes import silhouette
@@ -223,9 +223,9 @@ def test_reduced_frames_of_single_lights_are_read_once(
 
     monkeypatch.setattr(Capture, "_read", counted)
     (tmp_path / "frames-killed").mkdir()
-    with frames_kept(capture, tmp_path) as kept:
+    with cached_frames(capture, tmp_path) as kept:
         assert [path.name for path in tmp_path.iterdir()] != ["frames-killed"]
-        assert kept_bytes(capture.view(undistorted=False)) == 13 * 4 * 26 * 26
+        assert cache_bytes(capture.view(undistorted=False)) == 13 * 4 * 26 * 26
         for step in (*capture.of_kind("olat"), *capture.of_kind("dark")):
             for camera in capture.rig.cameras:
                 image, saturated = capture.response_and_saturated(step, camera.name)
@@ -240,5 +240,5 @@ def test_reduced_frames_of_single_lights_are_read_once(
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     for view in (bent, capture):
-        with frames_kept(view, tmp_path) as kept:
+        with cached_frames(view, tmp_path) as kept:
             assert kept is view

@@ -179,7 +179,7 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     def found(mesh: Mesh) -> tuple[Any, Stage]:
         capture, report = Shaded(mesh, around(160), LIGHTS), Report()
         heads = Heads(Model(tmp_path), ReconstructOptions(grid=3e-3), silent, report)
-        return heads.by_light(MaskedCapture(capture, capture.masks)), report.stages[-1]
+        return heads.fit_by_shading(MaskedCapture(capture, capture.masks)), report.stages[-1]
 
     mine, stage = found(head)
     assert mine is not None

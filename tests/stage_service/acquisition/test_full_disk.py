@@ -49,7 +49,7 @@ def test_a_disk_that_fills_up_ends_the_capture_and_costs_no_journalled_frame(tmp
     missing = 120 - out["written"]
     ended = "manifest.json is missing" if "finish" in out else "The capture's outcome is 'failed'"
     assert out["verify"][0].startswith(ended)
-    assert out["verify"][1].startswith(f"{missing} planned frames were never shot")
+    assert out["verify"][1].startswith(f"{missing} planned frames were never captured")
     assert len(out["verify"]) == 2
     assert (out["resumed"], out["verify_resumed"], out["verify_compressed"]) == ("", [], [])
 

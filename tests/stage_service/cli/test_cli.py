@@ -321,7 +321,7 @@ def test_reconstruct_tells_what_it_would_take(capsys, tmp_path):
     for to in (("--estimate",), ("--out", tmp_path / "m")):
         code, data = run(capsys, "reconstruct", tmp_path / "c", *to, "--hold-out-light", "nope")
         assert code == 3
-        assert "there is no light nope; its 2 are a, b" in data["error"]["detail"]
+        assert "no light nope; its 2 are a, b" in data["error"]["detail"]
 
 
 def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
