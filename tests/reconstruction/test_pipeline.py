@@ -319,7 +319,7 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     assert [s.name for s in told.stages] == [s.name for s in report.stages]
     assert report["head"].figures["used_share"] > 0.9
     assert report["head"].figures["rms_mm"] < 0.5
-    assert any("taken to face" in w for w in report["head"].warnings)
+    assert any("assumed to face" in w for w in report["head"].warnings)
     strands = read_strands(tmp_path / "model" / "strands.npz")
     assert np.abs(np.linalg.norm(strands.roots, axis=1) - HEAD).max() < 2e-3
     with np.load(tmp_path / "model" / "scalp_map.npz") as data:

@@ -481,6 +481,6 @@ def test_bad_input_is_named(tmp_path):
     with pytest.raises(KeyError, match="no camera 'cam_7'"):
         writer.write_frame(STEPS[0], "cam_7", good)
     writer.write_frame(STEPS[0], "cam_0", good)
-    with pytest.raises(CaptureError, match="written already"):
+    with pytest.raises(CaptureError, match="already written"):
         writer.write_frame(STEPS[0], "cam_0", good)
     writer.close()

@@ -135,9 +135,9 @@ def test_cameras_that_do_not_say_where_the_subject_is() -> None:
         for e in EYES
     ]
     assert "there is only one" in Origin.of(pair[:1]).notes[0]
-    for stage, why in ((parallel, "the same way"), (pair, "nearly the same"), (apart, "one place")):
+    for stage, why in ((parallel, "the same way"), (pair, "nearly parallel"), (apart, "one place")):
         origin = Origin.of(stage)
         assert not origin.moved
         (note,) = origin.notes
         assert why in note
-        assert "taken to be about the origin" in note
+        assert "assumed at the origin" in note

@@ -157,7 +157,7 @@ def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
         PictureError, match=r"there are ViewLayer\.Combined.*: write .* as RGB"
     ) as told:
         read_picture(path, Sensor(), (SIZE, SIZE))
-    assert "copy it anew" not in str(told.value)
+    assert "copy it again" not in str(told.value)
 
 
 def test_an_exr_of_grey_or_of_channels_of_several_types_is_read(tmp_path):
@@ -329,7 +329,7 @@ def test_missing_frames_are_values(folder, tmp_path):
     assert not capture.has_light("light_001", "left")
     assert capture.has_light("light_001", "right")
     assert any("light_002" in note for note in capture.plan["import"]["notes"])
-    assert not any("no picture of" in note for note in capture.plan["import"]["notes"])
+    assert not any("all frames are missing" in note for note in capture.plan["import"]["notes"])
     for picture in (folder / "images" / "right").iterdir():
         picture.unlink()
     capture = import_folder(folder, tmp_path / "again")
@@ -470,8 +470,8 @@ def is_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("break_it", "says"),
     [
-        (cut_off, "copy it anew"),
-        (is_text, "copy it anew"),
+        (cut_off, "copy it again"),
+        (is_text, "copy it again"),
         (is_smaller, "12x24 pixels, its camera has 24x24: give a picture of that size"),
     ],
 )
@@ -515,7 +515,7 @@ def test_a_raw_file_is_light_between_its_black_and_white(tmp_path):
 @pytest.mark.parametrize(
     ("sensor", "says"),
     [
-        ({"mosaic": (RED, GREEN, RED, BLUE)}, "no Bayer mosaic: develop it"),
+        ({"mosaic": (RED, GREEN, RED, BLUE)}, "not a Bayer mosaic: develop it"),
         ({"black": WHITE}, "black 65535 must be below white 65535"),
     ],
 )

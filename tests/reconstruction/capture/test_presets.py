@@ -130,7 +130,7 @@ def test_takes_without_the_pattern_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PresetProblem, match="fully lit frames are not brighter"):
         find_pattern(level, order)
     level[[*AT_0, *range(190, 250)]] = 300
-    with pytest.raises(PresetProblem, match=r"on in the frames 0, 20, 41.* cannot be named"):
+    with pytest.raises(PresetProblem, match=r"on in the frames 0, 20, 41.* cannot be identified"):
         find_pattern(level, order)
     with pytest.raises(PresetProblem, match="300 frames, the pattern of lights has 349"):
         find_pattern(level[:300], order)

@@ -152,11 +152,11 @@ def test_input_that_looks_wrong_is_said() -> None:
     assert input_warnings(row(), row()) == []
     millimetres = Strands(row().points * np.float32(1e3), row().offsets)
     assert "span 128 m" in input_warnings(millimetres, row())[0]
-    assert "both in metres?" in input_warnings(millimetres, row())[0]
+    assert "both are in metres" in input_warnings(millimetres, row())[0]
     assert "one frame" in input_warnings(row().transformed(np.eye(3), [3, 0, 0]), row())[0]
     to_y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     y_up = brush(600).transformed(to_y_up, [0, 0, 0])
-    assert "are both z up?" in input_warnings(y_up, brush(600))[0]
+    assert "both are z up" in input_warnings(y_up, brush(600))[0]
     assert input_warnings(brush(600), brush(600)) == []
     still = Strands(np.repeat(row().points[:2], 2, axis=0), [0, 2, 4])
     assert "2 of 2 predicted strands have no length" in input_warnings(still, still)[-1]

@@ -144,7 +144,7 @@ def test_mitsuba_reads_our_uncompressed_file(tmp_path: Path) -> None:
 
 def test_attributes_that_do_not_fit_are_refused() -> None:
     exr, image = UncompressedExr(2, 2), np.zeros((2, 2, 3), np.float32)
-    with pytest.raises(ValueError, match="the attributes do not fit"):
+    with pytest.raises(ValueError, match="the attributes exceed"):
         exr.fill(image, {"note": "x" * 9000})
     with pytest.raises(ValueError, match="1 to 31 bytes"):
         exr.fill(image, {"x" * 32: 1.0})

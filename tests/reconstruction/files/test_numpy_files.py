@@ -52,7 +52,7 @@ SHAPE = "{'descr':'<f4','fortran_order':False,'shape':%s}"
     ("data", "why"),
     [
         (header(SHAPE % "(99999999999,3)"), r"needs 1199999999988 bytes, the file has"),
-        (header(SHAPE % "(-2,)"), "absurd shape"),
+        (header(SHAPE % "(-2,)"), "invalid shape"),
         (header(SHAPE % "(2,"), "header"),
         (header("(" * 90), "header"),
         (header("{'descr':'<c8','fortran_order':False,'shape':(1,)}"), "unexpected type"),

@@ -78,6 +78,6 @@ def test_a_claim_of_ten_gigabytes_takes_no_memory(suffix: str, side: int, tmp_pa
         pass
     with peak_memory() as peak, pytest.raises(PictureError, match=f"claims{suffix}") as problem:
         read_picture(path, Sensor(), (side, side))
-    assert "copy it anew" in str(problem.value) or "60000x60000 pixels" in str(problem.value)
+    assert "copy it again" in str(problem.value) or "60000x60000 pixels" in str(problem.value)
     if before.gb is not None and peak.gb is not None:
         assert peak.gb - before.gb < 0.2

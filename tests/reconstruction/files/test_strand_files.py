@@ -375,7 +375,7 @@ def write_npy(path: Path, name: str, header: bytes, data: bytes) -> None:
     [
         (b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,3)}", "needs .* bytes"),
         (b"{'descr':'|O','fortran_order':False,'shape':(1,3)}", "unexpected type"),
-        (b"{'descr':'<f4','fortran_order':False,'shape':(-1,3)}", "absurd shape"),
+        (b"{'descr':'<f4','fortran_order':False,'shape':(-1,3)}", "invalid shape"),
         (b"{'descr':'<f4','fortran_order':False,'shape':(6,)}", r"must be \(N, 3\)"),
         (b"nonsense", "points"),
     ],

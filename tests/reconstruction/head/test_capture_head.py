@@ -143,7 +143,7 @@ def test_too_little_skin_says_what_to_give(capture: Capture) -> None:
     with pytest.raises(CaptureError, match=words):
         skin_points(MaskedCapture(capture, all_hair), cloud)
     empty = PointCloud.empty(cloud.cameras, cloud.projectors)
-    with pytest.raises(CaptureError, match="no sweep to find a head by"):
+    with pytest.raises(CaptureError, match="nor a sweep to fit a head to"):
         skin_points(MaskedCapture(capture, masks), empty)
 
 

@@ -124,13 +124,13 @@ def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: Part) 
     points, outward = 1.03 * places[on][::4] + [0.01, 0.02, 0.03], normals[on][::4]
     hints = HeadHints(part=part)
     assert not fit_head(points, outward, hints=hints).warnings
-    with pytest.raises(HeadFitError, match="the normals point into the head: turn them round"):
+    with pytest.raises(HeadFitError, match="the normals point into the head: reverse them"):
         fit_head(points, -outward, hints=hints)
 
 
 def test_a_mesh_that_is_inside_out_is_an_error_that_says_so() -> None:
     head = generic_head()
-    with pytest.raises(HeadFitError, match=r"turn them round \(the faces, of a mesh\)"):
+    with pytest.raises(HeadFitError, match=r"reverse them \(for a mesh, its faces\)"):
         mark_scalp(Mesh(100 * head.vertices, head.faces[:, ::-1]))
 
 
@@ -138,20 +138,20 @@ def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> N
     points, normals = seen(crown, 500)
     fit = fit_head(points, normals, hints=HeadHints(part="scalp"))
     assert any("hardly determine" in w for w in fit.warnings)
-    assert any("give landmarks" in w for w in fit.warnings)
+    assert any("provide landmarks" in w for w in fit.warnings)
     vertices = generic_head().vertices[::1500]
     known = another_head().vertices[::1500]
     fit = fit_head(points, normals, hints=HeadHints(part="scalp", landmarks=(vertices, known)))
-    assert not any("give landmarks" in w for w in fit.warnings)
+    assert not any("provide landmarks" in w for w in fit.warnings)
     assert np.degrees(Rotation.from_matrix(fit.pose.rotation @ TURN.T).magnitude()) < 15
 
 
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
-        (1000, "look like millimetres; multiply them by 0.001"),
-        (100, "look like centimetres; multiply them by 0.01"),
-        (10, "look like decimetres; multiply them by 0.1"),
+        (1000, "in millimetres; multiply them by 0.001"),
+        (100, "in centimetres; multiply them by 0.01"),
+        (10, "in decimetres; multiply them by 0.1"),
         (0.1, r"spread only 0\.1\d* times"),
         (0.6, "times the template's size"),
     ],
@@ -167,8 +167,8 @@ def test_another_unit_is_an_error_that_says_so(factor: float, words: str) -> Non
     [
         (np.zeros((0, 3)), "0 points, at least 10"),
         (np.ones((9, 3)), "9 points, at least 10"),
-        (np.ones((20, 3)), "coincide or lie on a line"),
-        (np.linspace(0, 0.2, 60).reshape(20, 3) * [1, 0, 0], "coincide or lie on a line"),
+        (np.ones((20, 3)), "coincide or are collinear"),
+        (np.linspace(0, 0.2, 60).reshape(20, 3) * [1, 0, 0], "coincide or are collinear"),
         (np.full((20, 3), np.nan), "20 points are not finite, the first is number 0"),
     ],
 )
@@ -186,7 +186,7 @@ def test_what_else_is_asked_wrongly() -> None:
         fit_head(points, normals[1:])
     with pytest.raises(HeadFitError, match="at least 3 pairs of landmarks"):
         fit_head(points, hints=HeadHints(landmarks=(points[:2], points[:2])))
-    with pytest.raises(HeadFitError, match="lie on a line"):
+    with pytest.raises(HeadFitError, match="are collinear"):
         fit_head(points, hints=HeadHints(landmarks=(np.eye(3) * [1, 0, 0], np.eye(3) * [1, 0, 0])))
     with pytest.raises(ValueError, match="part must be"):
         fit_head(points, hints=HeadHints(part="nose"))  # type: ignore[arg-type]

@@ -61,7 +61,7 @@ def test_an_unmarked_scalp_is_where_hair_lies_on_the_head() -> None:
 
 
 def test_no_hair_on_the_head_is_an_error() -> None:
-    with pytest.raises(NoScalp, match="share a frame"):
+    with pytest.raises(NoScalp, match="are in one"):
         find_scalp(egg(), shell(lambda c: np.zeros(len(c), bool)))
     with pytest.raises(NoScalp, match="marks no scalp"):
         find_scalp(egg())

@@ -392,7 +392,7 @@ def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkey
     assert (
         main(["evaluate", "geometry", *(str(tmp_path / f"{n}.npz") for n in ("mm", "true"))]) == 130
     )
-    assert "both in metres?" in capsys.readouterr().err
+    assert "both are in metres" in capsys.readouterr().err
 
 
 def test_evaluate_geometry_leaves_a_models_report_alone(capsys, tmp_path):
@@ -431,10 +431,10 @@ def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_pat
 
     code, data = run(capsys, *command, tmp_path / "mm.npz", true)
     assert code == 0
-    assert "both in metres?" in data["warnings"][0]
+    assert "both are in metres" in data["warnings"][0]
     code, data = run(capsys, *command, tmp_path / "none.npz", true)
     assert code == 0
-    assert data["warnings"] == ["there are no predicted strands: precision is given as 0"]
+    assert data["warnings"] == ["there are no predicted strands: precision is 0"]
     assert data["all"]["3mm_30deg"]["f"] == 0
     for pred, other, said in [
         (true, tmp_path / "none.npz", "none.npz: no strands"),
