@@ -113,7 +113,7 @@ def test_what_shines_beside_a_mirror_is_warned_of(
         assert (stage.figures["highlights_rms_px"] > 10) == warned
         said = [w for w in stage.warnings if "no lamp is in view" in w]
         assert len(said) == warned
-        assert all("is its radius 50 mm" in w for w in said)
+        assert all("its radius is 50 mm" in w for w in said)
 
 
 def test_a_part_of_a_rig_in_any_order_is_compared_by_name(true_rig: Rig) -> None:
@@ -154,8 +154,8 @@ def test_a_device_that_the_truth_lacks_is_told_before_the_work(
         ({"paper": 80.0}, "paper: expected an albedo above 0 and at most 1, got 80"),
         ({"paper": 0.0}, "paper: expected an albedo"),
         ({"diffuse_albedo": float("nan")}, "diffuse sphere: expected an albedo"),
-        ({"mirror_radius": -0.05}, "mirror sphere: its radius"),
-        ({"diffuse_radius": float("inf")}, "diffuse sphere: its radius"),
+        ({"mirror_radius": -0.05}, "mirror sphere: expected a radius"),
+        ({"diffuse_radius": float("inf")}, "diffuse sphere: expected a radius"),
     ],
 )
 def test_what_no_target_can_be_is_refused(wrong: dict[str, float], said: str) -> None:
@@ -178,7 +178,7 @@ def test_what_no_capture_shows_stays_nominal_and_is_listed(
 def test_a_capture_without_the_board_is_an_error(
     nominal_rig: Rig, diffuse_captures: list[Capture]
 ) -> None:
-    with pytest.raises(CalibrationError, match="in 0 of the captures"):
+    with pytest.raises(CalibrationError, match="visible in 0 captures"):
         calibrate(nominal_rig, TargetCaptures(diffuse_captures))
 
 

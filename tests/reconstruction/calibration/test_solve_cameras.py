@@ -76,7 +76,7 @@ def test_a_camera_that_does_not_see_the_board_is_named(
     nominal_rig: Rig, board: Board, noisy_sightings: Sightings
 ) -> None:
     blind = {**noisy_sightings, "cam_1": {}}
-    with pytest.raises(CalibrationError, match=r"cam_1: sees .* in 0 of the captures"):
+    with pytest.raises(CalibrationError, match=r"cam_1: .* visible in 0 captures"):
         calibrate_cameras(nominal_rig.cameras, board, blind)
 
 
@@ -85,7 +85,7 @@ def test_one_pose_leaves_lenses_open_but_places_cameras_whose_lens_is_kept(
 ) -> None:
     prop = board_pose(0, board)
     one = {c.name: {"only": exact(c, prop, seed=k)} for k, c in enumerate(true_rig.cameras)}
-    with pytest.raises(CalibrationError, match=r"in 1 of the captures, .* need 3"):
+    with pytest.raises(CalibrationError, match=r"in 1 captures, expected 3"):
         calibrate_cameras(true_rig.cameras, board, one)
     found = calibrate_cameras(true_rig.cameras, board, one, keep_lens=True)
     errors = compare_rigs(Rig("found", found.cameras, ()), replace(true_rig, lights=()))
@@ -113,7 +113,7 @@ def test_parallel_poses_leave_the_lens_open(board: Board) -> None:
     camera = Camera.look_at("front", 320, 256, (0.95, 0, 0), (0, 0, 0), 24.0)
     shifts = np.random.default_rng(2).uniform(-0.04, 0.04, (4, 3)) * (0, 1, 1)
     seen = {f"{k}": exact(camera, level_board(board, s), seed=k) for k, s in enumerate(shifts)}
-    with pytest.raises(CalibrationError, match="front: 4 poses of the board leave the lens open"):
+    with pytest.raises(CalibrationError, match="front: 4 poses of the board do not determine"):
         calibrate_cameras([camera], board, {"front": seen})
 
 

@@ -171,7 +171,7 @@ def test_absent_and_broken_files_are_named(folder: Path, tmp_path: Path, file: s
 def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
     path = folder / "images" / "left" / "light_07.exr"
     write_exr(path, np.zeros((8, 6, 3), np.float32))
-    with pytest.raises(ImportProblem, match=r"light_07\.exr: 6x8 pixels, its camera has 8x6"):
+    with pytest.raises(ImportProblem, match=r"light_07\.exr: 6x8 pixels, expected 8x6"):
         import_folder(folder, tmp_path / "out")
     write_exr(path, np.full((6, 8, 3), np.nan, np.float32))
     with pytest.raises(ImportProblem, match=r"light_07\.exr: has pixels that are not finite"):
@@ -180,12 +180,12 @@ def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ImportProblem, match=r"left\.png: expected a PNG"):
         import_folder(folder, tmp_path / "out")
     cv2.imwrite(str(folder / "masks" / "left.png"), np.ones((6, 8), np.uint8))
-    with pytest.raises(ImportProblem, match=r"left\.png: shows nothing: .* brightest pixel is 1"):
+    with pytest.raises(ImportProblem, match=r"left\.png: is empty: .* brightest pixel is 1"):
         import_folder(folder, tmp_path / "out")
     cut_out = np.full((6, 8, 4), 255, np.uint8)
     cut_out[:, 4:, 3] = 0  # white under a transparent background
     cv2.imwrite(str(folder / "masks" / "left.png"), cut_out)
-    with pytest.raises(ImportProblem, match=r"left\.png: is 50% opaque and, .* 100% half grey"):
+    with pytest.raises(ImportProblem, match=r"left\.png: is 50% opaque, but 100%"):
         import_folder(folder, tmp_path / "out")
     (folder / "head.obj").write_text("v 0 0 0\n")
     (folder / "masks" / "left.png").unlink()

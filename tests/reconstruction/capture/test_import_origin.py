@@ -135,7 +135,7 @@ def test_cameras_that_do_not_say_where_the_subject_is() -> None:
         for e in EYES
     ]
     assert "there is only one" in Origin.of(pair[:1]).notes[0]
-    for stage, why in ((parallel, "the same way"), (pair, "nearly parallel"), (apart, "one place")):
+    for stage, why in ((parallel, "are parallel"), (pair, "nearly parallel"), (apart, "one point")):
         origin = Origin.of(stage)
         assert not origin.moved
         (note,) = origin.notes

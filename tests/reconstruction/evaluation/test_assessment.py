@@ -159,7 +159,7 @@ def test_input_that_looks_wrong_is_said() -> None:
     assert "both are z up" in input_warnings(y_up, brush(600))[0]
     assert input_warnings(brush(600), brush(600)) == []
     still = Strands(np.repeat(row().points[:2], 2, axis=0), [0, 2, 4])
-    assert "2 of 2 predicted strands have no length" in input_warnings(still, still)[-1]
+    assert "2 of 2 predicted strands have zero length" in input_warnings(still, still)[-1]
 
 
 @pytest.mark.parametrize(

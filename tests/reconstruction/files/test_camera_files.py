@@ -124,7 +124,7 @@ def test_cameras_that_metashape_has_not_aligned_are_told(tmp_path: Path) -> None
     path = tmp_path / "cameras.xml"
     writers.write_metashape(path, stage())
     file = read_cameras(path)
-    assert any(note.endswith("not aligned, left out: lost") for note in file.notes)
+    assert any(note.endswith("not aligned, skipped: lost") for note in file.notes)
     assert file.metres == 1
     good = path.read_text()
     for old, new, words in (
@@ -145,7 +145,7 @@ def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cam.yml"
     for text, words in (
         ("not: [yaml", "OpenCV cannot read it"),
-        ("%YAML:1.0\n---\nwidth: 3\n", "has one of K, camera_matrix"),
+        ("%YAML:1.0\n---\nwidth: 3\n", "expected one of K, camera_matrix"),
         ('%YAML:1.0\n---\nK: "text"\n', "K must be .* finite numbers"),
         (
             "%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [1, 2]\n",
@@ -166,7 +166,7 @@ def test_a_camera_alone_and_a_map_without_a_camera_in_json(tmp_path: Path) -> No
     path.write_text(json.dumps(data))
     found = read_cameras(path)
     assert_same_pixels(found.cameras, [first])
-    assert [n.endswith(f"is there: {second.name}") for n in found.notes] == [True]
+    assert [n.endswith(f": {second.name}") for n in found.notes] == [True]
     alone = tmp_path / f"{first.name}.json"
     alone.write_text(json.dumps(data[first.name]))
     assert_same_pixels(read_cameras(alone).cameras, [first])
@@ -177,11 +177,11 @@ def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
     writers.write_transforms(path, stage())
     data = json.loads(path.read_text())
-    data["frames"] = {
-        f"{i}_{k}": {**frame, "file_path": f"images/{frame['file_path'][7:13]}/{k:03d}.png"}
-        for i, frame in enumerate(data["frames"])
+    data["frames"] = [
+        {**frame, "file_path": f"images/{frame['file_path'][7:13]}/{k:03d}.png"}
+        for frame in data["frames"]
         for k in range(3)
-    }
+    ]
     path.write_text(json.dumps(data))
     assert_same_pixels(read_cameras(path).cameras, stage())
 
@@ -246,13 +246,13 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     cameras.write_text(lenses.replace("12 FULL_OPENCV", "12 FOV"))
     refused("FOV has 5 parameters, got 12")
     cameras.unlink()
-    refused("none of what is known is in it: a COLMAP model")
+    refused("no camera file found; expected a COLMAP model")
     refused("no such file", tmp_path / "nowhere")
     binary = tmp_path / "binary"
     writers.write_colmap_binary(binary, stage())
     whole = (binary / "images.bin").read_bytes()
     (binary / "images.bin").write_bytes(whole[:-20])
-    refused(r"images\.bin: ends at byte .* is cut off", binary)
+    refused(r"images\.bin: ends at byte .* is truncated", binary)
     (binary / "images.bin").write_bytes(whole[:83] + b"\xff" * 8 + whole[91:])
     refused(r"images\.bin: .*cut off", binary)
     transforms = tmp_path / "transforms.json"

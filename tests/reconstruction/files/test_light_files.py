@@ -34,7 +34,7 @@ def test_four_numbers_are_a_name_and_a_place_only_where_the_first_may_be_a_name(
     path.write_text("5 1.0 1.2 0.3\n")
     assert read_lights(path).lights[0].name == "light_005"
     path.write_text("0.5 1.0 1.2 300\n")
-    with pytest.raises(LightFileError, match=r"row 1 begins with 0.5: .*x, y, z, intensity"):
+    with pytest.raises(LightFileError, match=r"row 1: 0.5 is ambiguous"):
         read_lights(path)
     path.write_text("-812 1500 300 2\n-500 1400 200 2\n")  # whole millimetres
     with pytest.raises(LightFileError, match=r"row 1 begins with -812: .*x, y, z, intensity"):

@@ -91,7 +91,7 @@ def npy(shape: tuple[int, int]) -> bytes:
     [
         ("a.txt", b"", r"a\.txt: expected a file of points"),
         ("a.csv", b"", r"a\.csv: expected \(N, 3\)"),
-        ("a.csv", b"1,2,3\n1,2\n", "line 2: 2 numbers, 3 before"),
+        ("a.csv", b"1,2,3\n1,2\n", "line 2: 2 numbers, expected 3"),
         ("a.csv", b"1,2,3\n1,b,3\n", "line 2: expected numbers"),
         ("a.csv", b"1,2,nan\n", "point 0 is not finite"),
         ("a.obj", b"f 1 2 3\n", r"a\.obj: expected \(N, 3\)"),

@@ -475,7 +475,7 @@ def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
     [
         ("cubic", "[0.02]", "only linear curves"),
         ("linear", "[0.02, 0.03, 0.04]", "3 widths for 1 curves"),
-        ("linear", "[0.02, 0]", "1 of 2 widths are not above 0: give strands a width up to"),
+        ("linear", "[0.02, 0]", "1 of 2 widths are not above 0"),
     ],
 )
 def test_usd_that_cannot_be_read(kind: str, widths: str, words: str, tmp_path: Path) -> None:

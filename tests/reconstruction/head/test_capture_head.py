@@ -139,7 +139,7 @@ def test_too_little_skin_says_what_to_give(capture: Capture) -> None:
         k: HairMask(m.subject, m.subject, m.subject & False, "silhouette", 0.0)
         for k, m in masks.items()
     }
-    words = rf"no head\.obj, and only 0 cells.*at least {FEWEST_SKIN}.*option scalp_points"
+    words = rf"no head\.obj, .* in only 0 cells.*expected {FEWEST_SKIN}.*option scalp_points"
     with pytest.raises(CaptureError, match=words):
         skin_points(MaskedCapture(capture, all_hair), cloud)
     empty = PointCloud.empty(cloud.cameras, cloud.projectors)
@@ -151,7 +151,7 @@ def test_points_that_are_no_head_are_a_capture_error(capture: Capture, tmp_path:
     np.save(tmp_path / "scalp.npy", np.random.default_rng(0).random((50, 3)) * 1e3)
     known = digitised_points(capture, tmp_path / "scalp.npy")
     assert known is not None
-    with pytest.raises(CaptureError, match=r"no head fits the points of scalp\.npy.*millimetres"):
+    with pytest.raises(CaptureError, match=r"no head could be fitted to scalp\.npy.*millimetres"):
         fit_capture_head(known, None, Stage("head"))
 
 

@@ -188,7 +188,7 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     flat = Mesh(head.vertices * [1.0, 0.6, 1.0], head.faces, head.scalp)
     none, stage = found(flat)
     assert none is None
-    assert "off the template's, more than 3: give head.obj" in stage.warnings[-1]
+    assert "RMS from the template, limit 3 mm; provide head.obj" in stage.warnings[-1]
     assert not (tmp_path / "head.obj").exists()
 
 
