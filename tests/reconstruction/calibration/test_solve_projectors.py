@@ -75,7 +75,7 @@ def test_a_board_in_one_plane_leaves_the_planes_of_light_open(
 
 
 def test_a_board_without_light_is_an_error(nominal_rig: Rig) -> None:
-    with pytest.raises(CalibrationError, match="projector beam: 0 points of the board decode"):
+    with pytest.raises(CalibrationError, match="projector beam: 0 points were decoded"):
         calibrate_projector(nominal_rig.projectors[0], DecodedRows.join([]))
 
 

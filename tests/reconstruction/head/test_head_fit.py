@@ -152,7 +152,7 @@ def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> N
         (1000, "in millimetres; multiply them by 0.001"),
         (100, "in centimetres; multiply them by 0.01"),
         (10, "in decimetres; multiply them by 0.1"),
-        (0.1, r"spread only 0\.1\d* times"),
+        (0.1, r"extent is only 0\.1\d* times"),
         (0.6, "times the template's size"),
     ],
 )
