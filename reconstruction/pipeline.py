@@ -8,8 +8,8 @@ from typing import Literal
 
 from reconstruction.arrays import AnyFloats
 from reconstruction.capture.folder import Capture
-from reconstruction.capture.records import CaptureError
 from reconstruction.capture.frame_cache import cached_frames
+from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.mesh_queries import inside_mesh
 from reconstruction.geometry.strands import Strands
 from reconstruction.growing import GrowingStages

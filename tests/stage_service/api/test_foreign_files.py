@@ -27,7 +27,7 @@ def test_heads_and_masks_are_refused_by_what_they_unpack_to(http, tmp_path):
         ("head.obj", bombs.obj(3_800_000), "3,800,000 faces; at most 1,000,000 are read"),
         ("head.obj", bombs.polygon(15_000_000), "line 4: more than 65,536 characters"),
         ("masks/cam_0.png", bombs.png(8, 6, data=b"", more=text)[:-30], "damaged"),
-        ("masks/cam_0.png", bombs.png(8, 6, data=text[11:-4]), "more data than so many pixels"),
+        ("masks/cam_0.png", bombs.png(8, 6, data=text[11:-4]), "more data than these pixels"),
         ("masks/cam_0.png", bombs.png(0xEA60, 0xEA60, data=b""), "8x6 pixels, got 60000x60000"),
     ):
         answer, peak = grown(lambda p=place, d=data: http.put(f"/uploads/s/{p}", content=d))
