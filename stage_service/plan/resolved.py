@@ -70,7 +70,8 @@ class ResolvedPlan:
             raise PlanError([f"{folder} does not exist: check its disk"]) from None
         if needed + RESERVE > free:
             need, kept, have = (f"{n / 1e9:.2f} GB" for n in (needed, RESERVE, free))
-            raise PlanError([f"the plan writes {need} and leaves {kept} free, {folder} has {have}"])
+            fits = f"the plan writes {need} and keeps a reserve of {kept}"
+            raise PlanError([f"{fits}, but {folder} has {have} free: make room"])
 
     @cached_property
     def cost(self) -> PlanCost:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -130,6 +131,14 @@ class Counted(str):
         return str.__eq__(self, other)
 
     __hash__ = str.__hash__
+
+
+def test_a_disk_without_room_is_told_with_what_the_plan_needs(demo, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=270_000_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    need = r"writes 0\.\d\d GB and keeps a reserve of 0\.27 GB, but .* has 0\.27 GB free: make room"
+    with pytest.raises(PlanError, match=need):
+        resolve(CapturePlan(), demo).check_room(tmp_path)
 
 
 def test_many_names_that_the_rig_lacks_are_not_compared_with_each_other(demo):
