@@ -100,7 +100,7 @@ def test_the_command_line_darkens_and_says_what_it_knows(http, world, capsys):
         told = capsys.readouterr()
         return code, told.out + told.err
 
-    assert run("status") == (0, "ok: lamps dark, no capture runs, no worker is there\n")
+    assert run("status") == (0, "ok: lamps dark, no capture runs, no worker runs\n")
     world.lit = {2}
     code, told = run("blackout")
     assert (code, world.lit, told.partition(":")[0]) == (0, set(), "dark")
