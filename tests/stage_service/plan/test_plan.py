@@ -136,7 +136,7 @@ class Counted(str):
 def test_a_disk_without_room_is_told_with_what_the_plan_needs(demo, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=270_000_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    need = r"writes 0\.\d\d GB and keeps a reserve of 0\.27 GB, but .* has 0\.27 GB free: make room"
+    need = r"writes 1\.35 GB and keeps a reserve of 0\.27 GB, but .* has 0\.27 GB free: make room"
     with pytest.raises(PlanError, match=need):
         resolve(CapturePlan(), demo).check_room(tmp_path)
 
