@@ -33,7 +33,6 @@ from hypothesis.stateful import (
     RuleBasedStateMachine,
     initialize,
     invariant,
-    precondition,
     rule,
     run_state_machine_as_test,
 )
@@ -387,9 +386,6 @@ class Stage(RuleBasedStateMachine):
         self.refused_to(person, made)
         self.settle()
 
-    def is_running(self) -> bool:
-        return self.captures.running is not None
-
     @rule(person=PEOPLE, action=st.sampled_from(["pause", "resume", "abort"]), stall=STALLS)
     def steer(self, person: str, action: str, stall: str | None) -> None:
         """What runs, or what is started for it."""
@@ -459,23 +455,22 @@ class Stage(RuleBasedStateMachine):
             self.wanted[entry.id] = wanted
         self.settle()
 
-    def waits(self) -> bool:
-        return bool(self.service.queue.view().waiting)
-
-    @precondition(waits)
     @rule(person=PEOPLE, which=st.integers(0, 9), place=st.sampled_from([None, 0, 1, 3]))
     def move_or_remove(self, person: str, which: int, place: int | None) -> None:
         entry, by, queue = self.entry(which), self.by(person), self.service.queue
+        if entry is None:
+            return self.skip()
         if place is None:
             self.attempt(lambda: queue.remove(entry, by))
         else:
             self.attempt(lambda: queue.move(entry, place, by))
         self.settle()
 
-    @precondition(waits)
     @rule(person=PEOPLE, which=st.integers(0, 9), armed=st.booleans())
     def start_entry(self, person: str, which: int, armed: bool) -> None:
         entry, by = self.entry(which), self.by(person)
+        if entry is None:
+            return self.skip()
         wanted = self.wanted[entry]
         name = f"{person} {wanted.lamp} {self.happened}" if armed else None
         with self.rights.lock:
@@ -484,9 +479,13 @@ class Stage(RuleBasedStateMachine):
         self.refused_to(person, made)
         self.settle()
 
-    def entry(self, which: int) -> str:
+    def entry(self, which: int) -> str | None:
         waiting = self.service.queue.view().waiting
-        return str(waiting[which % len(waiting)].id)
+        return str(waiting[which % len(waiting)].id) if waiting else None
+
+    def skip(self) -> None:
+        """No step. As a precondition it would depend on timing, which hypothesis does not take."""
+        self.done["steps"] -= 1
 
     @rule(person=PEOPLE, action=st.sampled_from(["hold", "read", "release", "release late"]))
     def queue(self, person: str, action: str) -> None:
@@ -643,10 +642,11 @@ class Stage(RuleBasedStateMachine):
         self.disk.fault = {"full": errno.ENOSPC, "read-only": errno.EROFS}.get(what)
         self.settle()
 
-    @precondition(is_running)
     @rule()
     def go_through(self) -> None:
         """What stalls goes through."""
+        if self.captures.running is None:
+            return self.skip()
         self.let_go()
         self.settle()
 
@@ -720,15 +720,17 @@ def run(
 
 
 def test_no_lamp_goes_on_without_permission(monkeypatch, tmp_path, wire, world):
-    done = run(monkeypatch, tmp_path, wire, world, examples=40, steps=15, derandomize=True)
+    done = run(monkeypatch, tmp_path, wire, world, examples=45, steps=15, derandomize=True)
     assert done["steps"] >= 500
     assert done["lights"] > 0
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_no_lamp_goes_on_without_permission_in_ten_thousand_steps(
     monkeypatch, tmp_path, wire, world
 ):
-    done = run(monkeypatch, tmp_path, wire, world, examples=420, steps=25, derandomize=False)
+    done = run(monkeypatch, tmp_path, wire, world, examples=480, steps=25, derandomize=False)
+    print(dict(done))
     assert done["steps"] >= 10_000
     assert done["lights"] > 0
