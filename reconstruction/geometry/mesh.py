@@ -103,7 +103,9 @@ def read_obj(path: str | Path, most: int | None = None) -> Mesh:
         raise ValueError(f"{path}: no faces; expected a triangle mesh in Wavefront OBJ")
     try:
         return Mesh(np.array(vertices), np.array(faces), np.array(scalp) if any(scalp) else None)
-    except (ValueError, OverflowError) as error:
+    except OverflowError:  # an index beyond 64 bits
+        raise ValueError(f"{path}: mesh faces must index the {len(vertices)} vertices") from None
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 

@@ -84,6 +84,7 @@ def test_polygons_slashes_and_negative_indices(tmp_path: Path) -> None:
         ("v 0 0 zero\n", r"m\.obj, line 1: "),
         ("v 0 0 0\nv 1 0 0\nf 1 2 x\n", r"m\.obj, line 3: "),
         ("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 4\n", r"m\.obj.*index the 3 vertices"),
+        (f"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 {10**20}\n", r"m\.obj.*index the 3 vertices"),
         ("v 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", r"m\.obj, line 1: "),
     ],
 )
