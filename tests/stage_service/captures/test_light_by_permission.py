@@ -262,7 +262,7 @@ class Stage(RuleBasedStateMachine):
 
     @property
     def line(self) -> CaptureQueue:
-        return self.service.queue._line
+        return self.service.queue._queue
 
     @property
     def captures(self) -> Any:
