@@ -84,7 +84,7 @@ def skin_points(masked: MaskedCapture, cloud: PointCloud) -> HeadPoints:
     capture, masks = masked.capture, masked.masks
     if not len(cloud):
         raise CaptureError(
-            f"{capture.path}: neither head.obj nor a sweep to fit a head to: provide head.obj or "
+            f"{capture.path}: no head.obj, nor a sweep to fit a head to: provide head.obj or "
             "scalp.obj, or use the method auto, which fits a head to the face under single lights"
         )
     skin, hair = np.zeros((2, len(cloud)), bool)

@@ -69,7 +69,7 @@ def test_outlines_of_another_radius_than_told_are_warned_of(
         seen = float(text.split("a radius of ")[1].split(" mm")[0])
         assert seen == pytest.approx(60, abs=1.0)
         assert f"{capture.path}: " in text
-        assert f"not of {1e3 * radius:g} mm" in text
+        assert f"expected {1e3 * radius:g} mm" in text
     warnings.clear()  # one camera tells size or distance
     gather_shading(diffuse_captures, true_rig.cameras[:1], radius, 0.8, ["lamp_0"], warnings.append)
     assert warnings == []

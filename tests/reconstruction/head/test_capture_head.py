@@ -195,7 +195,7 @@ def test_the_users_head_is_a_template(
 
 
 def test_a_mesh_that_is_no_head_is_refused() -> None:
-    with pytest.raises(HeadFitError, match="wholly above 9"):
+    with pytest.raises(HeadFitError, match="entirely above 9"):
         template(generic_head(), above=9.0)
     marked, fit = template(generic_head())
     assert fit is None
