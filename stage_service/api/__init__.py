@@ -1,1 +1,1 @@
-"""The HTTP face of the service: thin routes over `service.Service`, which knows no HTTP."""
+"""The HTTP API: thin routes over `service.Service`, which does not depend on HTTP."""

@@ -1,4 +1,4 @@
-"""Which connections go in from the porch, by the head of their first request."""
+"""Which waiting connections are admitted, by the head of their first request."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ from starlette.datastructures import Headers
 from stage_service.api.connections import Hall
 from stage_service.api.entrance import EXPRESS, STOP
 from stage_service.api.gate import Access
-from stage_service.api.pace import Paced
 from stage_service.api.places import AGAIN_S, Owner
 from stage_service.api.porch import Verdict
 from stage_service.api.problems import problem_response
+from stage_service.api.throttle import Throttled
 from stage_service.web.headers import INERT
 
 
 class Admission:
-    """Judges connections: those of callers who may steer go in at once, and those that darken; the
-    others in turn, while there are places for their owners or they need none. `running()` is the id
-    of the capture that is shot."""
+    """Judges connections. Callers who may steer and requests that darken are admitted at once,
+    others in turn while their owner has a place or needs none. `running()` is the id of the running
+    capture."""
 
     def __init__(self, access: Access, hall: Hall, running: Callable[[], str | None]) -> None:
         self._access, self._hall, self._running = access, hall, running
 
     def judge(self, head: bytes, address: str) -> Verdict:
-        """What becomes of a connection that begins with `head`: nothing, where it is encrypted."""
-        asked, headers = _parsed(head)
-        stop = STOP.fullmatch(asked)
+        """The verdict on a connection that begins with `head`, empty if it is encrypted."""
+        request, headers = _parsed(head)
+        stop = STOP.fullmatch(request)
         stops = stop is not None and stop[1] in (None, self._running())
         identity = self._access.identity(headers)
         if identity is None and stops:
             identity = self._access.darkens(headers)
         owner = Owner.of(identity, (address, 0))
-        express = stops or EXPRESS.fullmatch(asked) is not None
+        express = stops or EXPRESS.fullmatch(request) is not None
         return Verdict(
             owner,
             at_once=owner.steers or (stops and identity is not None),
             may=lambda: express or self._hall.lacks(owner) is None,
-            refusal=lambda: self._refusal(owner, asked.partition(" ")[2]),
+            refusal=lambda: self._refusal(owner, request.partition(" ")[2]),
         )
 
     def _refusal(self, owner: Owner, path: str) -> bytes:
-        """A whole answer, 429 or 503."""
-        why = self._hall.lacks(owner) or Paced()
+        """A complete response, 429 or 503."""
+        why = self._hall.lacks(owner) or Throttled()
         response = problem_response(path, "no-place", str(why), status=why.status)
         more = {"retry-after": str(AGAIN_S), "connection": "close"}
         response.headers.update({**INERT, **more})
@@ -56,8 +56,8 @@ class Admission:
 
 
 def _parsed(head: bytes) -> tuple[str, Headers]:
-    """Method and path of a request as `STOP` has them, and its headers. What cannot be read is
-    nobody's: the server says what is wrong with it."""
+    """Method and path of a request as `STOP` has them, and its headers; the server rejects what
+    cannot be parsed."""
     first, *lines = head.partition(b"\r\n\r\n")[0].split(b"\r\n")
     words = first.decode("latin-1").split(" ")
     pairs = (line.partition(b":") for line in lines)

@@ -45,10 +45,10 @@ from stage_service.api.downloads import Heads
 from stage_service.api.entrance import Entrance
 from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
-from stage_service.api.pace import Pace
 from stage_service.api.places import Places
 from stage_service.api.porch import Porch
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
+from stage_service.api.throttle import Throttle
 from stage_service.records.refusals import Refusals
 from stage_service.service import Service
 from stage_service.stopping import Ending
@@ -57,15 +57,15 @@ from stage_service.web import pages
 from stage_service.web.headers import SafeHeaders
 
 REQUESTS_S = 1
-"""Requests that are under way once everything else has been closed have so long."""
+"""Seconds for requests that are under way after everything else has been closed."""
 THREADS_S = 1.0
-"""And their threads, and the interpreter's own end, so long after that."""
+"""Seconds after that for their threads and the interpreter's end."""
 
 
 def create_app(service: Service, access: Access | None = None) -> FastAPI:
     """The application over `service`; starts it, and closes it (lights off) at shutdown.
 
-    Without `access` everybody on this machine may do everything.
+    Without `access` everybody on this machine has all scopes.
     """
 
     @contextlib.asynccontextmanager
@@ -121,9 +121,8 @@ def _completed(
     refusals: Refusals | None = None,
     running: Callable[[], str | None] = lambda: None,
 ) -> FastAPI:
-    """What every application of ours has: the viewer, problem documents, places, gate, safe
-    headers."""
-    app.state.places, app.state.pace = Places(share()), Pace(lambda: running() is not None)
+    """Add what both applications have: viewer, problem documents, places, gate, safe headers."""
+    app.state.places, app.state.throttle = Places(share()), Throttle(lambda: running() is not None)
     app.state.access, app.state.running = access, running
     install_problems(app)
     for part in (viewing.page, viewing.reading, viewing.router):
@@ -132,14 +131,13 @@ def _completed(
     app.add_middleware(Heads)
     app.add_middleware(Entrance, running=running)
     app.add_middleware(Gate, access=access, refusals=refusals)
-    app.add_middleware(SafeHeaders)  # outside: what the gate refuses has them, too
+    app.add_middleware(SafeHeaders)  # outermost: responses of the gate have them too
     return app
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Says when requests are answered; connections come to it over a porch. Once it is to stop,
-    requests have `REQUESTS_S`, and it ends by `STOP_S` whatever hangs. A second signal leaves them
-    no time."""
+    """Calls `ready` when it serves; connections come from a `Porch`. After a signal, requests have
+    `REQUESTS_S`, then it ends even if something hangs. A second signal ends it at once."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, ready: Callable[[], None]) -> None:
         super().__init__(config)
@@ -176,13 +174,13 @@ class AnnouncingServer(uvicorn.Server):
         try:
             self._close()
         finally:
-            # What it says of requests that it cuts off, `Ending` says in a line.
+            # `Ending` logs requests that are cut off in one line
             logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
             ending.by(REQUESTS_S + THREADS_S)
             super().handle_exit(sig, None)
 
     def _close(self) -> None:
-        """Close what is served, while requests are still answered."""
+        """Close what is served, while requests are still processed."""
 
     def _under_way(self) -> str:
         requests = len(self.server_state.tasks)
@@ -199,9 +197,9 @@ class AnnouncingServer(uvicorn.Server):
         task.add_done_callback(self._admitting.discard)
 
     async def _connect(self, link: socket.socket) -> None:
-        """Serve a connection, once its encryption is agreed upon."""
+        """Serve a connection, after the TLS handshake."""
         encryption = self.config.ssl
-        with suppress(OSError):  # the client has gone, or does not encrypt
+        with suppress(OSError):  # the client has gone, or does not use TLS
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._connection,
                 link,
@@ -217,8 +215,7 @@ class AnnouncingServer(uvicorn.Server):
 
 
 class _Server(AnnouncingServer):
-    """Puts the lights off at the signal itself, and answers until everything has been closed:
-    blackout and health, above all."""
+    """Puts the lights off at the signal, and serves blackout and health until all is closed."""
 
     def __init__(
         self, config: uvicorn.Config, app: FastAPI, service: Service, ready: Callable[[], None]
@@ -232,8 +229,8 @@ class _Server(AnnouncingServer):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Where a service listens: `socket`, a Unix socket's path, else `host` and `port` (0: any free
-    one), with TLS where there is a `certificate` (and its `key`, where that file lacks it)."""
+    """Where a service listens: the Unix socket `socket`, else `host` and `port` (0: any free one),
+    with TLS if it has a `certificate` (and its `key`, if in another file)."""
 
     host: str = LOOPBACK
     port: int = 0
@@ -243,7 +240,7 @@ class Endpoint:
 
     @property
     def local(self) -> bool:
-        """Whether it is reached from this machine alone."""
+        """Whether only this machine can reach it."""
         return self.socket is not None or self.name in OWN_NAMES
 
     @property
@@ -252,7 +249,7 @@ class Endpoint:
         return f"[{self.host}]" if ":" in self.host else self.host.lower()
 
     def url(self, port: int) -> str:
-        """Where it is asked when it listens on `port`."""
+        """Its URL when it listens on `port`."""
         if self.socket is not None:
             return f"unix:{self.socket.resolve()}"
         return f"http{'s' if self.certificate else ''}://{self.name}:{port}"
@@ -263,7 +260,7 @@ def serve_viewer(
 ) -> None:
     """Serve the viewer of `models` to this machine until SIGINT or SIGTERM.
 
-    `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
+    `ready` is called with the URL when it serves. Raises `OSError` when the port is taken.
     """
     with listening(LOOPBACK, port, None) as listener:
         allow_files()
@@ -287,7 +284,7 @@ def serve(
 ) -> None:
     """Serve `service` at `endpoint` until SIGTERM or SIGINT.
 
-    `ready` is told the URL once requests are answered. Raises `OSError` when the port is taken.
+    `ready` is called with the URL when it serves. Raises `OSError` when the port is taken.
     """
     with listening(endpoint.host, endpoint.port, endpoint.socket) as listener:
         allow_files()

@@ -1,4 +1,4 @@
-"""Bodies of requests: how large they may be, how fast they come, and whether they are JSON."""
+"""Bodies of requests: limits of size and time, and whether they are JSON."""
 
 from __future__ import annotations
 
@@ -14,34 +14,33 @@ from starlette.types import Message, Receive, Send
 from reconstruction.reading import parse_json
 
 MOST_BODY, MOST_OTHERS = 1 << 20, 128 << 10
-"""Bytes of a request; of one by a caller without `steer`, the largest of which has the weights of
-1,000 lights. 1 MB of JSON keeps the event loop for 10 ms and more."""
+"""Bytes of a request; of one by a caller without `steer`, enough for the weights of 1,000 lights.
+Parsing 1 MB of JSON blocks the event loop for 10 ms."""
 BODY_S = 20.0
-"""A request's body is there within this time."""
+"""Deadline for a request's body."""
 MOST_UPLOAD, UPLOAD_S = 32 << 20, 120.0
-"""Bytes of an upload, which is in memory, and the time within which it is there."""
+"""Bytes of an upload, which is held in memory, and its deadline."""
 GRACE_S, FLOOR = 5.0, 8 << 10
-"""From then on so many bytes a second, on average, have come of a body: one that stands still holds
-its place no longer."""
+"""After `GRACE_S` a body must have arrived at `FLOOR` bytes a second on average."""
 LINGER_S = 10.0
-"""How long a request that is refused may go on sending."""
+"""How long a refused request may continue to send."""
 
 
 class TooSlow(Exception):
-    """A body did not come in time."""
+    """A body missed its deadline."""
 
     def __init__(self, came: int, seconds: float) -> None:
         super().__init__(
-            f"of the request's body {came:,} bytes had come after {seconds:.0f} s: expected "
-            f"{FLOOR:,} bytes a second at least; send it again, over a faster connection"
+            f"received {came:,} bytes of the request's body in {seconds:.0f} s, expected at least "
+            f"{FLOOR:,} bytes a second: send it again over a faster connection"
         )
 
 
 class TooLarge(Exception):
-    """A body is larger than it may be."""
+    """A body exceeds its limit."""
 
     def __init__(self, most: int) -> None:
-        super().__init__(f"a request has at most {most:,} bytes")
+        super().__init__(f"a request may have at most {most:,} bytes")
 
 
 class Left(Exception):
@@ -55,8 +54,10 @@ async def read(
     within_s: float,
     pause: Callable[[], Awaitable[object]],
 ) -> bytes:
-    """The whole body, with a `pause` after each part but the last. Raises `TooLarge` beyond `most`
-    bytes, `TooSlow` where it has not come within `within_s` seconds, or hardly comes, and `Left`.
+    """The whole body, with a `pause` after each part but the last.
+
+    Raises `TooLarge` beyond `most` bytes, `TooSlow` after `within_s` seconds or below `FLOOR`, and
+    `Left`.
     """
     length = headers.get("content-length", "")
     if length.isdigit() and int(length) > most:
@@ -86,17 +87,17 @@ async def _seconds(pause: Callable[[], Awaitable[object]]) -> float:
 
 
 def again(body: bytes, receive: Receive) -> Receive:
-    """Gives the body that was read already, then what comes."""
-    waiting: list[Any] = [{"type": "http.request", "body": body, "more_body": False}]
+    """A `receive` that gives the body that was read already, then further messages."""
+    pending: list[Any] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def next_message() -> Message:
-        return waiting.pop() if waiting else await receive()
+        return pending.pop() if pending else await receive()
 
     return next_message
 
 
 def not_json(headers: Headers, body: bytes) -> str | None:
-    """Why a body that calls itself JSON, or nothing at all, cannot be read as such."""
+    """Why a body of JSON or unnamed content type cannot be parsed; None if it can."""
     kind = headers.get("content-type", "json").partition(";")[0].strip().lower()
     if not body or not kind.endswith("json"):
         return None
@@ -110,10 +111,8 @@ def not_json(headers: Headers, body: bytes) -> str | None:
 def lingering(
     headers: Headers, receive: Receive, send: Send, pause: Callable[[], Awaitable[object]]
 ) -> Send:
-    """Sends an answer, then takes and forgets what the client still sends before the last word,
-    with a `pause` after each part.
-
-    A connection that is closed with unread bytes is reset, and the answer is lost with it.
+    """A `send` that discards the rest of the request's body before the end of the response, with a
+    `pause` after each part: a connection closed with unread bytes is reset and loses the response.
     """
 
     async def rest() -> None:
@@ -125,7 +124,7 @@ def lingering(
 
     async def send_then_wait(message: Message) -> None:
         last = message["type"] == "http.response.body" and not message.get("more_body", False)
-        if last and "expect" not in headers:  # who expects to be asked sends nothing yet
+        if last and "expect" not in headers:  # a client that expects 100 sends nothing yet
             await send({**message, "more_body": True})
             with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER_S):

@@ -1,4 +1,4 @@
-"""Routes of calibration: what cameras see of the board, and the rig that comes of it."""
+"""Routes of calibration: detected boards, and the calibrated rig."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ reading = APIRouter(dependencies=READS, tags=["calibration"])
 def get_board(
     capture: str, camera: str, service: OnService, board: Annotated[BoardQuery, Query()]
 ) -> BoardView:
-    """What a camera's lit frame shows of the board, and how far each corner is from where the lens
-    has it."""
+    """Corners of the board in a camera's lit frame, with their reprojection errors."""
     return service.frames.board(capture, camera, board)
 
 
 @router.post("/calibration", status_code=status.HTTP_202_ACCEPTED)
 def calibrate(body: CalibrationRequest, service: OnService, by: Processes) -> CalibrationView:
-    """Calibrate the rig by captures of a board and of spheres; the event "calibration.state" says
-    when it is done. One that runs is ended."""
+    """Calibrate the rig by captures of a board and of spheres; the event "calibration.state"
+    reports its end. A running calibration is cancelled."""
     return service.calibrate(body, by)
 
 
 @reading.get("/calibration")
 def get_calibration(service: OnService) -> CalibrationView:
-    """How the newest calibration goes, and what it found."""
+    """State and results of the latest calibration."""
     return service.calibrating.view()
 
 
 @reading.get("/calibration/rig.json", response_class=FileResponse, responses=RANGES)
 def get_rig_file(service: OnService) -> Response:
-    """The calibrated rig file, to serve with."""
+    """The calibrated rig file, for `hairstage serve --rig`."""
     return file_response(service.calibrated(), "application/json")

@@ -1,7 +1,7 @@
-"""Connections: fewer than would take a capture's file descriptors, and none that only waits.
+"""Connections: limited so that a capture keeps enough file descriptors, and ended when idle.
 
-A connection is in the hall until a request says whose it is; it takes one of its owner's places
-then, or stays where the one that has waited longest makes room for the next.
+A connection is in the hall until its first request identifies its owner. It then takes one of the
+owner's places; without one it stays in the hall, where the longest waiting makes room for the next.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from stage_service.api.places import LIMITS, NoPlace, Owner, Places
 
 LOOPBACK = "127.0.0.1"
 HALL = 112
-"""Connections of which nobody knows whose they are, or whose owners have no place. With the places
-they are half of the descriptors that `select`, and most systems, allow a process."""
+"""Connections without a known owner or without a place. Together with all places they are half of
+the descriptors that `select`, and most systems, allow a process."""
 HEADER_S = 5.0
-"""A request's headers are there within this time."""
+"""Deadline for a request's headers."""
 KEPT_S = 60.0
-"""How long a connection of somebody who may steer waits for its next request: a blackout over it
-queues behind no new ones. Those of others wait for `HEADER_S`."""
+"""Keep-alive of connections with the scope `steer`, so that a blackout needs no new connection;
+others have `HEADER_S`."""
 STALL_S, FLOOR = 5.0, 16 << 10
-"""An answer is ended of which fewer bytes a second are taken over so many seconds."""
+"""A response is ended if the client takes fewer bytes a second over so many seconds."""
 MOST_HEADER_BYTES = 16 << 10
 QUEUED = 1024
-"""Connections that the kernel lets wait until they are accepted."""
+"""Backlog of the listening socket."""
 FILES = 8192
-"""Files that a service has itself allowed to open, where it may."""
+"""Limit of open files that a service requests."""
 _NO_ROOM = (
     b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 1\r\n"
     b"content-length: 0\r\n\r\n"
@@ -43,7 +43,7 @@ _EXTENSION = "hairstage"
 
 
 class Hall:
-    """All connections of a service: those inside have no place among `places` yet."""
+    """All connections of a service; those inside have none of `places` yet."""
 
     def __init__(self, places: Places, most: int = HALL) -> None:
         self._places, self._most = places, most
@@ -52,15 +52,14 @@ class Hall:
         self._watch: asyncio.TimerHandle | None = None
 
     def enter(self, connection: Connection) -> bool:
-        """Let a new one in, if need be for the one that has waited longest; whether it is in."""
+        """Take a new one in, if necessary in place of the longest waiting; whether it is in."""
         if self._watch is None:
             self._look()
         self._inside.add(connection)
         return len(self._inside) <= self._most or _drop_longest(self._inside - {connection})
 
     def lacks(self, owner: Owner) -> NoPlace | None:
-        """Why a connection of this owner's would find no place now, not even that of another which
-        waits for its client."""
+        """Why this owner could get no place now, not even that of an idle connection."""
         lacks = self._places.lacks("connections", owner)
         return lacks if not any(c.idle for c in self._of(owner)) else None
 
@@ -68,8 +67,8 @@ class Hall:
         return (c for c in self._owned if c.owner == owner)
 
     def own(self, connection: Connection, owner: Owner) -> None:
-        """Give it a place of its owner's, if need be that of one that waits for its client. Raises
-        `NoPlace`, and leaves it where it is."""
+        """Give it a place of its owner, if necessary that of an idle connection. Raises
+        `NoPlace`."""
         try:
             self._places.take("connections", owner)
         except NoPlace:
@@ -81,7 +80,7 @@ class Hall:
         connection.owner = owner
 
     def leave(self, connection: Connection) -> None:
-        """It has gone, or is about to."""
+        """Remove it and free its place."""
         self._inside.discard(connection)
         self._owned.discard(connection)
         if connection.owner is not None:
@@ -89,7 +88,7 @@ class Hall:
             connection.owner = None
 
     def _look(self) -> None:
-        """End what nobody takes."""
+        """End connections whose responses are not taken."""
         loop = asyncio.get_running_loop()
         for connection in [*self._inside, *self._owned]:
             connection.look(loop.time())
@@ -97,15 +96,14 @@ class Hall:
 
 
 class Connection(H11Protocol):
-    """uvicorn's connection with deadlines for headers and for the taking of answers, in the `hall`
-    of its service."""
+    """uvicorn's connection with deadlines for headers and for taking responses, in a `hall`."""
 
     hall: ClassVar[Hall]
     owner: Owner | None = None
     since = 0.0
     gone = False
     parked: asyncio.Task[Any] | None = None
-    """What waits for a place or a turn, and is cancelled where the connection ends."""
+    """The task that waits for a place or a turn, cancelled when the connection ends."""
     _deadline: asyncio.TimerHandle | None = None
     _stalled: tuple[float, int] | None = None
 
@@ -140,14 +138,14 @@ class Connection(H11Protocol):
         super().resume_writing()
 
     def own(self, owner: Owner) -> None:
-        """Count it as `owner`'s from here on. Raises `NoPlace`."""
+        """Count it as `owner`'s from now on. Raises `NoPlace`."""
         if owner != self.owner:
             self.hall.own(self, owner)
             self.timeout_keep_alive = int(KEPT_S if owner.steers else HEADER_S)
 
     @property
     def waits(self) -> bool:
-        """Whether no whole request is under way on it, or one that waits for its turn."""
+        """Whether it has no complete request, or one that waits for its turn."""
         return self._between or self.cycle.more_body or self.parked is not None
 
     @property
@@ -160,8 +158,8 @@ class Connection(H11Protocol):
         return self.cycle is None or self.cycle.response_complete
 
     def look(self, now: float) -> None:
-        """End it where its answer is not taken. Nothing is added to an answer that stands still, so
-        that what is left of it says how much was taken; one that is closed goes on until then."""
+        """End it if its response is not taken. Nothing is added to a stalled response, so the size
+        of the buffer shows how much was taken."""
         left = self.transport.get_write_buffer_size()
         if not left or not (self.flow.write_paused or self._between):
             self._stalled = None
@@ -174,7 +172,7 @@ class Connection(H11Protocol):
                 self._stalled = now, left
 
     def drop(self) -> None:
-        """End it, whatever it was about to say."""
+        """End it at once."""
         self._end()
         self.connections.discard(self)
         self.transport.abort()
@@ -205,7 +203,7 @@ class Connection(H11Protocol):
 
 
 def _drop_longest(connections: Iterable[Connection]) -> bool:
-    """Drop the one that has waited longest; whether any waits."""
+    """Drop the longest waiting connection; whether there was one."""
     waiting = [c for c in connections if c.waits]
     longest = min(waiting, key=lambda c: c.since, default=None)
     if longest is not None:
@@ -214,13 +212,13 @@ def _drop_longest(connections: Iterable[Connection]) -> bool:
 
 
 def connection_of(scope: Scope) -> Connection | None:
-    """What a request came over; None with another server than ours."""
+    """The connection of a request; None with another server."""
     found: Connection | None = scope.get("extensions", {}).get(_EXTENSION, {}).get("connection")
     return found
 
 
 def allow_files() -> None:
-    """Have this process allowed `FILES` files, or as many as it can."""
+    """Raise this process's limit of open files to `FILES`, or as far as possible."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if most > soft:
@@ -229,27 +227,27 @@ def allow_files() -> None:
 
 
 def files_allowed() -> int:
-    """How many files this process may open."""
+    """This process's limit of open files."""
     return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 def share() -> float:
-    """How many of all places this process has descriptors for."""
+    """Share of all places for which this process has descriptors."""
     return min(1.0, files_allowed() / 2 / (HALL + LIMITS["connections"].all))
 
 
 def protocol(places: Places) -> type[Connection]:
-    """`Connection` in a hall of its own, with as many places as there are descriptors for."""
+    """`Connection` with a new hall, sized by the number of descriptors."""
     hall = Hall(places, max(1, int(share() * HALL)))
     return type("Connection", (Connection,), {"hall": hall})
 
 
 def limits(places: Places) -> dict[str, Any]:
-    """What uvicorn is to be configured with."""
+    """Settings of uvicorn."""
     return {
         "http": protocol(places),
         "ws": "none",
-        "proxy_headers": False,  # else a client on this machine writes its own address itself
+        "proxy_headers": False,  # else a client on this machine can forge its address
         "timeout_keep_alive": int(HEADER_S),
         "h11_max_incomplete_event_size": MOST_HEADER_BYTES,
     }
@@ -262,7 +260,7 @@ def listening(host: str = LOOPBACK, port: int = 0, unix: Path | None = None) -> 
     """
     if unix is not None:
         return _at(unix)
-    # With the protocol named: asyncio sets TCP_NODELAY on what such a socket accepts and no other.
+    # protocol named: asyncio sets TCP_NODELAY only on connections of such a socket
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -270,12 +268,12 @@ def listening(host: str = LOOPBACK, port: int = 0, unix: Path | None = None) -> 
         listener.bind((host, port))
     except OverflowError as error:
         listener.close()
-        raise OSError(f"there is no port {port}: expected one from 0 to 65535") from error
+        raise OSError(f"port {port}: expected 0 to 65535") from error
     except OSError as error:
         listener.close()
         raise OSError(
-            f"port {port} on {host} cannot be used ({error.strerror}): is another service "
-            "running? choose another with --port"
+            f"port {port} on {host} cannot be used ({error.strerror}): stop the service that uses "
+            "it, or choose another with --port"
         ) from error
     return listener
 
@@ -286,8 +284,8 @@ def _at(path: Path) -> socket.socket:
         if path.is_socket():
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
                 if other.connect_ex(str(path)) == 0:
-                    raise OSError(f"{path}: another service answers there; choose another --socket")
-            path.unlink()  # left by one that died
+                    raise OSError(f"{path}: another service listens there: choose another --socket")
+            path.unlink()  # left by a service that died
         listener.bind(str(path))
         path.chmod(0o660)
     except OSError:

@@ -1,4 +1,4 @@
-"""Large answers: by ranges, with an ETag; folders as tar files; HEAD.
+"""Large responses: ranges, ETags, folders as tar files, HEAD.
 
 RFC 9110, 13 and 14: one range a request, `If-Range`, `If-None-Match`.
 """
@@ -23,27 +23,27 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stage_service.api.connections import connection_of
 from stage_service.api.entrance import no_place, owner_of
-from stage_service.api.pace import Turn
 from stage_service.api.places import NoPlace, Places
 from stage_service.api.problems import problem_response
+from stage_service.api.throttle import Throttle, Turn
 from stage_service.storage import InUse
 from stage_service.web.headers import attachment
 
 CHUNK = 256 << 10
-"""Bytes that are read at a time; an answer of no more is no download that counts."""
+"""Bytes that are read at a time; smaller responses do not count as downloads."""
 READERS, OTHER_READERS = 8, 2
-"""Downloads that read the disk at the same time: of callers who may steer, and of the others."""
+"""Concurrent disk reads of downloads: by callers with the scope `steer`, and by others."""
 Read = Callable[[int, int], bytes]
-"""The bytes from one place to (not with) another, or fewer of them."""
+"""Reads the bytes from one offset to before another, or fewer."""
 RANGES: dict[int | str, dict[str, Any]] = {
-    206: {"description": "The range that was asked for"},
+    206: {"description": "The requested range"},
     304: {"description": "Not modified: the ETag is that of If-None-Match"},
     416: {"description": "The range is beyond the end"},
 }
 
 
 class Ranged(Response):
-    """`size` bytes, as `read` gives them, or the range that is asked for."""
+    """`size` bytes, as `read` gives them, or the requested range."""
 
     def __init__(
         self,
@@ -63,29 +63,29 @@ class Ranged(Response):
             self.headers["content-disposition"] = attachment(name)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 200, 206, 304, 416, and 429 or 503 where the caller has no place for it."""
+        """Respond with 200, 206, 304 or 416, and with 429 or 503 if the caller has no place."""
         try:
-            await self._answer(scope, receive, send)
+            await self._respond(scope, receive, send)
         except NoPlace as error:
             await no_place(scope, error)(scope, receive, send)
         finally:
             self._close()
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        asked, etag = Headers(scope=scope), self.headers["etag"]
+    async def _respond(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers, etag = Headers(scope=scope), self.headers["etag"]
         known = [
-            tag.strip().removeprefix("W/") for tag in asked.get("if-none-match", "").split(",")
+            tag.strip().removeprefix("W/") for tag in headers.get("if-none-match", "").split(",")
         ]
         first, last = 0, self._size
         if etag in known or "*" in known:
             self.status_code, last = 304, 0
-        elif (found := self._range(asked)) is not None:
+        elif (found := self._range(headers)) is not None:
             first, last = found
             if first >= min(last, self._size):
-                detail = f"there are {self._size} bytes"
-                answer = problem_response(scope["path"], "http", detail, status=416)
-                answer.headers["content-range"] = f"bytes */{self._size}"
-                await answer(scope, receive, send)
+                detail = f"the file has {self._size} bytes"
+                response = problem_response(scope["path"], "http", detail, status=416)
+                response.headers["content-range"] = f"bytes */{self._size}"
+                await response(scope, receive, send)
                 return
             self.status_code, last = 206, min(last, self._size)
             self.headers["content-range"] = f"bytes {first}-{last - 1}/{self._size}"
@@ -99,12 +99,13 @@ class Ranged(Response):
             await self._send(first, last, scope, send)
 
     async def _send(self, first: int, last: int, scope: Scope, send: Send) -> None:
-        """Send the bytes, of a large answer to somebody who may not steer each part in its turn,
-        until the client has gone."""
-        connection, pace, steers = connection_of(scope), scope["app"].state.pace, _steers(scope)
+        """Send the bytes until the client has gone; without the scope `steer`, each part but the
+        first waits for a turn."""
+        connection, steers = connection_of(scope), _steers(scope)
+        throttle: Throttle = scope["app"].state.throttle
         more = False
         while first < last and not (connection is not None and connection.gone):
-            turn = await pace.turn(patient=True) if more and not steers else Turn()
+            turn = await throttle.turn(patient=True) if more and not steers else Turn()
             stop = min(first + CHUNK, last)
             try:
                 data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))
@@ -116,10 +117,10 @@ class Ranged(Response):
             await send({"type": "http.response.body", "body": data, "more_body": True})
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
-    def _range(self, asked: Headers) -> tuple[int, int] | None:
-        """From where to where; None: everything, also where a range is not understood."""
-        found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", asked.get("range", "").strip())
-        if found is None or asked.get("if-range", self.headers["etag"]) != self.headers["etag"]:
+    def _range(self, headers: Headers) -> tuple[int, int] | None:
+        """First byte, and the one after the last; None without a valid range: everything."""
+        found = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", headers.get("range", "").strip())
+        if found is None or headers.get("if-range", self.headers["etag"]) != self.headers["etag"]:
             return None
         first, last = found.groups()
         if not first:
@@ -130,14 +131,14 @@ class Ranged(Response):
 
 
 def file_response(file: Path, media_type: str) -> Ranged:
-    """A file. Raises `InUse` where it has just gone."""
+    """A file. Raises `InUse` if it has just been removed."""
     found = _stat(file)
     return Ranged(found.st_size, _reader(file), _etag(found), media_type)
 
 
 def opened_response(file: BinaryIO, media_type: str, name: str) -> Ranged:
-    """A file that is open, as `name`: whole, whatever becomes of its own name. It is closed after
-    the answer."""
+    """An open file, as `name`: complete even if it is removed meanwhile. It is closed
+    afterwards."""
     number = file.fileno()
     found = os.fstat(number)
     return Ranged(
@@ -151,13 +152,13 @@ def opened_response(file: BinaryIO, media_type: str, name: str) -> Ranged:
 
 
 def tar_response(name: str, files: Mapping[str, Path]) -> Ranged:
-    """The files, by their names in it, as `name`.tar. Raises `InUse` for one that has gone."""
+    """Files by their names in the archive, as `name`.tar. Raises `InUse` for a removed one."""
     tar = _Tar(name, files)
     return Ranged(tar.size, tar.read, tar.etag, "application/x-tar", f"{name}.tar")
 
 
 class _Tar:
-    """An uncompressed tar file that is nowhere: where each part begins is known beforehand."""
+    """An uncompressed tar file that is generated while it is sent, with known offsets."""
 
     def __init__(self, name: str, files: Mapping[str, Path]) -> None:
         digest = hashlib.sha256()
@@ -179,7 +180,7 @@ class _Tar:
         self._parts.append((size, read))
 
     def read(self, first: int, last: int) -> bytes:
-        """The bytes from `first` to (not with) `last`."""
+        """The bytes from `first` to before `last`."""
         return b"".join(self._pieces(first, last))
 
     def _pieces(self, first: int, last: int) -> Iterator[bytes]:
@@ -211,8 +212,10 @@ def _stat(file: Path) -> os.stat_result:
     try:
         return file.stat()
     except FileNotFoundError:
-        told = f"{file.name} has just gone: a job writes or compresses there. Ask again after it"
-        raise InUse(told) from None
+        raise InUse(
+            f"{file.name} has just been removed by a job that writes or compresses there: repeat "
+            "the request after the job"
+        ) from None
 
 
 def _reader(file: Path) -> Read:
@@ -237,11 +240,11 @@ def _readers(scope: Scope) -> CapacityLimiter:
 
 
 class _HeadersSent(Exception):
-    """All that a HEAD asked for."""
+    """The headers of a HEAD request have been sent."""
 
 
 class Heads:
-    """Answers HEAD with the headers that GET would have."""
+    """Responds to HEAD with the headers of GET."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,6 +1,6 @@
-"""What a request waits for once it is known who sent it: a place, its body, and a turn.
+"""What a request waits for after authentication: a place, its body, and a turn.
 
-All of it on the event loop. A blackout waits for nothing but the end of its caller's other ones.
+All on the event loop. A blackout waits only for the end of its caller's other blackouts.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stage_service.api import bodies
 from stage_service.api.connections import Connection, connection_of
-from stage_service.api.pace import Pace, Paced, Turn
 from stage_service.api.places import AGAIN_S, Kind, NoPlace, Owner, Places
 from stage_service.api.problems import problem_response
+from stage_service.api.throttle import Throttle, Throttled, Turn
 
 STOP = re.compile(r"POST (?:/devices/blackout|/queue:hold|/captures/([^/]+)/abort)")
-"""What darkens. An abort of another capture than the one that is shot darkens nothing."""
+"""Requests that darken the stage, if an abort names the running capture."""
 EXPRESS = re.compile(
     r"(?:GET|HEAD) (?:/|/health|/login|/docs|/favicon\.ico|/web/.*)|POST /(?:login|logout)"
 )
-"""What, beside `STOP`, is answered on a connection without a place: the way to the button."""
+"""Other requests that need no connection place: the way to the blackout button."""
 UPLOAD = re.compile(r"PUT (?:/uploads/|/view/models/).*")
 VIEWED = re.compile(r"[A-Z]+ /view/models/.+")
-"""What the tracer's process does: it takes no turn, but waits until no capture is shot."""
+"""Requests to the tracer's process: they take no turn, and wait until no capture runs."""
 
 
 VIEWED_LATER = (
-    "a capture is being shot: until it ends models are shown to tokens with the scope 'steer' "
-    "alone; try again after it"
+    "a capture is running: until its end models are shown only to tokens with the scope 'steer'; "
+    "try again after it"
 )
 
 
 class Entrance:
-    """Lets requests in whose callers have a place, with their body read, and refuses the others.
+    """Passes on requests whose callers have a place, with their body read, and refuses others.
 
-    `running()` is the id of the capture that is shot.
+    `running()` is the id of the running capture.
     """
 
     def __init__(self, app: ASGIApp, running: Callable[[], str | None]) -> None:
@@ -54,7 +54,7 @@ class Entrance:
         with _holding(scope) as held:
             try:
                 refusal = await self._enter(held, scope, receive, send)
-            except (NoPlace, Paced) as error:
+            except (NoPlace, Throttled) as error:
                 refusal = no_place(scope, error)
             except bodies.TooSlow as error:
                 refusal = problem_response(scope["path"], "http", str(error), status=408)
@@ -68,18 +68,18 @@ class Entrance:
     async def _enter(
         self, held: _Held, scope: Scope, receive: Receive, send: Send
     ) -> Response | None:
-        asked, owner = f"{scope['method']} {scope['path']}", held.owner
-        connection, stop = connection_of(scope), STOP.fullmatch(asked)
+        request, owner = f"{scope['method']} {scope['path']}", held.owner
+        connection, stop = connection_of(scope), STOP.fullmatch(request)
         if connection is not None:
             try:
                 connection.own(owner)
             except NoPlace:
-                if stop is None and EXPRESS.fullmatch(asked) is None:
+                if stop is None and EXPRESS.fullmatch(request) is None:
                     raise
                 send = _closing(send)
-        headers, upload = Headers(scope=scope), UPLOAD.fullmatch(asked) is not None
+        headers, upload = Headers(scope=scope), UPLOAD.fullmatch(request) is not None
         if stop is not None and stop[1] in (None, self._running()):
-            await held.wait("stops")  # which has no body, and waits for none
+            await held.wait("stops")  # it has no body to wait for
             await self._app(scope, bodies.again(b"", receive), held.sending(send))
             return None
         if upload:
@@ -89,9 +89,9 @@ class Entrance:
             most = bodies.MOST_BODY if owner.steers else bodies.MOST_OTHERS
             within_s = bodies.BODY_S
         body = await bodies.read(headers, receive, most, within_s, held.pause)
-        if VIEWED.fullmatch(asked):
+        if VIEWED.fullmatch(request):
             if not owner.steers and self._running() is not None:
-                raise Paced(VIEWED_LATER)
+                raise Throttled(VIEWED_LATER)
             await held.wait("renders")
         elif not (owner.steers and scope["path"] == "/health"):
             await held.wait("requests")
@@ -103,24 +103,24 @@ class Entrance:
         return None
 
 
-async def answer(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
-    """Send a refusal to somebody who has no place, in their turn: refusing costs something, too."""
+async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
+    """Send a refusal in the caller's turn, because refusals cost time too."""
     with _holding(scope) as held:
         try:
             await held.wait("requests")
             await held.turn()
-        except (NoPlace, Paced) as error:
+        except (NoPlace, Throttled) as error:
             response = no_place(scope, error)
         await _refuse(response, scope, receive, send, held)
 
 
 class _Held:
-    """What one request holds, until its answer begins; its upload's place until the end."""
+    """Places and turn of a request until its response begins; an upload's place until its end."""
 
     def __init__(self, scope: Scope) -> None:
         self.owner = owner_of(scope)
         self._places: Places = scope["app"].state.places
-        self._pace: Pace = scope["app"].state.pace
+        self._throttle: Throttle = scope["app"].state.throttle
         self._connection = connection_of(scope)
         self._kinds: list[Kind] = []
         self._turn = Turn()
@@ -132,18 +132,18 @@ class _Held:
         self._kinds.append(kind)
 
     async def turn(self) -> None:
-        """Wait for a turn, unless the caller may steer. Raises `Paced`."""
+        """Wait for a turn, unless the caller may steer. Raises `Throttled`."""
         if not self.owner.steers:
             with _parked(self._connection):
-                self._turn = await self._pace.turn()
+                self._turn = await self._throttle.turn()
 
     async def pause(self) -> None:
-        """Wait between two parts of a body, each of up to 64 KiB, for a turn's length."""
+        """Wait between two parts of a body, of up to 64 KiB each, for a turn."""
         if not self.owner.steers:
-            (await self._pace.turn(patient=True)).end()
+            (await self._throttle.turn(patient=True)).end()
 
     def sending(self, send: Send) -> Send:
-        """`send`, which gives all but an upload's place back when the answer begins."""
+        """`send`, which frees all but an upload's place when the response begins."""
 
         async def sending(message: Message) -> None:
             self.leave(keep="uploads")
@@ -152,7 +152,7 @@ class _Held:
         return sending
 
     def leave(self, keep: str = "") -> None:
-        """Give back what is held, but for one kind."""
+        """Free all places but those of kind `keep`, and end the turn."""
         self._turn.end()
         for kind in [k for k in self._kinds if k != keep]:
             self._kinds.remove(kind)
@@ -160,13 +160,13 @@ class _Held:
 
 
 def owner_of(scope: Scope) -> Owner:
-    """Whose places a request takes."""
+    """The owner of a request's places."""
     return Owner.of(scope.get("state", {}).get("identity"), scope.get("client"))
 
 
 @contextmanager
 def _holding(scope: Scope) -> Iterator[_Held]:
-    """What a request holds, given back at the block's end; which a client that has left ends."""
+    """Places and turn of a request, freed at the block's end, which a leaving client ends."""
     held, connection = _Held(scope), connection_of(scope)
     try:
         yield held
@@ -179,7 +179,7 @@ def _holding(scope: Scope) -> Iterator[_Held]:
 
 @contextmanager
 def _parked(connection: Connection | None) -> Iterator[None]:
-    """The connection may make room meanwhile, and its end ends the waiting."""
+    """Let the connection make room meanwhile; its end cancels the waiting."""
     if connection is None:
         yield
         return
@@ -190,8 +190,8 @@ def _parked(connection: Connection | None) -> Iterator[None]:
         connection.parked = None
 
 
-def no_place(scope: Scope, error: NoPlace | Paced) -> Response:
-    """The refusal of somebody who has no place, or no turn."""
+def no_place(scope: Scope, error: NoPlace | Throttled) -> Response:
+    """The refusal of a caller without a place or a turn."""
     response = problem_response(scope["path"], "no-place", str(error), status=error.status)
     response.headers["retry-after"] = str(AGAIN_S)
     return response
@@ -206,7 +206,7 @@ async def _refuse(
 
 
 def _closing(send: Send) -> Send:
-    """`send`, with which the connection is closed after the answer."""
+    """`send`, which closes the connection after the response."""
 
     async def closing(message: Message) -> None:
         if message["type"] == "http.response.start":

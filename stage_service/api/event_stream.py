@@ -14,33 +14,33 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.types import Receive, Scope, Send
 
 from stage_service.api.entrance import no_place, owner_of
-from stage_service.api.pace import Pace, Turn
 from stage_service.api.places import NoPlace, Places
 from stage_service.api.steering import READS
+from stage_service.api.throttle import Throttle, Turn
 from stage_service.records.events import EventLog
 from stage_service.records.tokens import Identity
 
 reading = APIRouter(dependencies=READS)
 LOOK_S = 0.5
-"""How often a stream looks whether its token still opens it."""
+"""Seconds between checks of a stream's token."""
 PACE_S, OTHERS_PACE_S = 1e-3, 10e-3
-"""From one round of news to the next, for each listener that may steer, and for each other: telling
-one takes about 0.1 ms, so that requests have the rest, and others take 1 % of a capture's time."""
+"""Seconds per listener between two rounds of events, with the scope `steer` and without. Sending to
+one listener takes about 0.1 ms, so listeners without `steer` take 1 % of a capture's time."""
 PULSE_S = 1.0
-"""A stream that has no event for so long carries a comment: whoever reads it can tell a service
-that has nothing to report from one that has stopped."""
+"""A stream without events carries a comment after so many seconds, which distinguishes an idle
+service from a stopped one."""
 _PULSE = b": pulse\r\n\r\n"
 MOST_AT_ONCE, MOST_PLACES = 500, 20
-"""Events in one piece, and pieces that are kept for others who stand at the same place."""
+"""Events per chunk; cached chunks for listeners at the same event."""
 FEW = 50
-"""Events that a listener without `steer` is given without a turn of its own."""
+"""Events that a listener without `steer` gets without a turn."""
 
 
 class Feed:
-    """The events as bytes, for many listeners on one event loop; no thread waits for any.
+    """The events as bytes, for many listeners on one event loop.
 
-    What has happened is sent to all of them at once, in rounds: those who may steer have rounds of
-    their own. Who stands at the same event as another is given the same bytes.
+    Events are sent in rounds to all listeners, in separate rounds to those with the scope `steer`.
+    Listeners at the same event share the same bytes.
     """
 
     def __init__(self, events: EventLog) -> None:
@@ -72,8 +72,8 @@ class Feed:
         return self._rounds[steers].sent - number
 
     async def after(self, number: int, within_s: float, steers: bool) -> tuple[int, bytes]:
-        """The number of the last event of those after `number` that come within this time, and
-        their text; `number` and nothing where none comes."""
+        """Events after `number` that come within this time: the last one's number, and their text;
+        `number` and nothing if none comes."""
         rounds = self._rounds[steers]
         if rounds.sent <= number:
             with suppress(TimeoutError):
@@ -100,16 +100,16 @@ class Feed:
     def _happened(self) -> None:
         """From any thread."""
         if self._loop is not None and any(r.idle for r in self._rounds.values()):
-            with suppress(RuntimeError):  # the loop is closed: nobody listens any more
-                self._loop.call_soon_threadsafe(self._tell_soon)
+            with suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(self._schedule)
 
-    def _tell_soon(self) -> None:
+    def _schedule(self) -> None:
         for rounds in self._rounds.values():
-            rounds.tell_soon()
+            rounds.schedule()
 
 
 class _Rounds:
-    """When some of the listeners are sent events, and up to which."""
+    """Rounds of one group of listeners: when events are sent, and up to which."""
 
     def __init__(self, events: EventLog, made: dict[int, tuple[int, bytes]], pace_s: float) -> None:
         self._events, self._made, self._pace_s = events, made, pace_s
@@ -119,19 +119,19 @@ class _Rounds:
 
     @property
     def idle(self) -> bool:
-        """Whether somebody listens, and no round is to come."""
+        """Whether there are listeners and no round is scheduled."""
         return self.listeners > 0 and not self._due
 
-    def tell_soon(self) -> None:
-        """Have a round, not too soon after the one before."""
+    def schedule(self) -> None:
+        """Schedule a round, at the pace of the group."""
         if self.idle:
             self._due = True
             loop = asyncio.get_running_loop()
             soonest = self._sent_at + self._pace_s * self.listeners
-            loop.call_at(max(loop.time(), soonest), self._tell)
+            loop.call_at(max(loop.time(), soonest), self._send)
 
-    def _tell(self) -> None:
-        self._due = False  # first: what happens from here on is for the next round
+    def _send(self) -> None:
+        self._due = False  # first: later events are for the next round
         self.sent, self._sent_at = self._events.last, asyncio.get_running_loop().time()
         self._made.clear()
         news, self.news = self.news, asyncio.Event()
@@ -139,10 +139,10 @@ class _Rounds:
 
 
 class _Stream(EventSourceResponse):
-    """Events, where their listener has a place."""
+    """Events for a listener that has a place."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send events until the client goes, or 429 or 503."""
+        """Send events until the client leaves, or 429 or 503."""
         places: Places = scope["app"].state.places
         try:
             with places.holding("streams", owner_of(scope)):
@@ -164,28 +164,28 @@ async def stream_events(
 ) -> EventSourceResponse:
     """Events after `Last-Event-ID` (or `after`), then new ones as they come.
 
-    Without either, only new ones; 0 replays all that are kept. Numbers start at 1 with the service:
-    a number that it has not reached yet is from before a restart, and replays everything. A token
-    that is revoked, or a login that ends, ends it. Without events a comment comes every second.
+    Without either, only new ones; 0 replays all stored events. Numbers start at 1 with the service:
+    a number that it has not reached is from before a restart and replays everything. The stream
+    ends when its token is revoked or its login ends. Without events a comment is sent every second.
     """
-    asked = last_event_id if last_event_id is not None else after
+    requested = last_event_id if last_event_id is not None else after
     newest = request.app.state.service.events.last
-    start = newest if asked is None else asked
+    start = newest if requested is None else requested
     follow = _follow(request, start if start <= newest else 0)
     return _Stream(follow, ping=86400)  # `_PULSE` replaces its comments
 
 
 async def _follow(request: Request, number: int) -> AsyncIterator[bytes]:
     feed: Feed = request.app.state.feed
-    pace: Pace = request.app.state.pace
+    throttle: Throttle = request.app.state.throttle
     owner, clock = owner_of(request.scope), asyncio.get_running_loop().time
     sent = clock()
     with feed.listening(owner.steers):
         while _may(request):
-            looked = clock()
-            while (left := looked + LOOK_S - clock()) > 0:
+            checked = clock()
+            while (left := checked + LOOK_S - clock()) > 0:
                 much = not owner.steers and feed.pending(number, owner.steers) > FEW
-                turn = await pace.turn(patient=True) if much else Turn()
+                turn = await throttle.turn(patient=True) if much else Turn()
                 try:
                     number, text = await feed.after(number, left, owner.steers)
                 finally:
@@ -199,6 +199,6 @@ async def _follow(request: Request, number: int) -> AsyncIterator[bytes]:
 
 
 def _may(request: Request) -> bool:
-    """Whether the caller may still do what they might: a token that is revoked ends the stream."""
+    """Whether the caller's identity is unchanged: a revoked token ends the stream."""
     identity: Identity | None = request.state.identify(request.headers)
     return identity == request.state.identity

@@ -1,6 +1,6 @@
-"""What a request passes before a route sees it: whom it is for, and who sent it.
+"""Checks of a request before its route: host, origin, identity and scope.
 
-All of it on the event loop, so that a blackout waits for no thread here.
+All on the event loop, so that a blackout waits for no thread here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import partial
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from stage_service.api.entrance import answer
+from stage_service.api.entrance import refuse
 from stage_service.api.login import cookies, place
 from stage_service.api.problems import problem_response
 from stage_service.api.scopes import Route, route_of
@@ -25,15 +25,15 @@ OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 VIEW, VIEW_PAGE = "/view", "/view/page/"
 ANYBODY = Identity(name="", scopes=SCOPES)
 DARK = ("POST", "/devices/blackout")
-"""The one request that a page's right to a blackout opens."""
+"""The only request allowed by a page's blackout right."""
 NAMES = {"/devices/blackout": "blackout", "/login": "login"}
-"""What the audit log calls them, refused or not."""
+"""Their names in the audit log."""
 
 
 @dataclass(frozen=True)
 class Access:
-    """Who gets in: by host names that are this service's (in lower case), and by `tokens`, sent
-    with each request or once to log in; None: everybody."""
+    """Access by `names`, the service's host names in lower case, and by `tokens`, sent with each
+    request or once to log in; None admits everybody."""
 
     tokens: Tokens | None = None
     names: frozenset[str] = OWN_NAMES
@@ -41,10 +41,10 @@ class Access:
     attempts: Attempts = field(default_factory=Attempts)
 
     def refusal(self, headers: Headers) -> tuple[str, str, int | None] | None:
-        """Why a browser may have been made to send this, as a problem's kind, detail, status.
+        """Kind, detail and status of a problem if a foreign web page may have caused the request.
 
-        The listener takes connections from this machine alone, as a rule; but a web page from
-        elsewhere, open in a browser here, can post to it, or point its own host name at it.
+        The service usually listens on this machine only, but a foreign page in a browser here can
+        post to it, or resolve its own host name to it.
         """
         host = headers.get("host", "")
         if _name(host).lower() not in self.names:
@@ -52,12 +52,12 @@ class Access:
         own = {f"{scheme}://{host}" for scheme in ("http", "https")}
         for origin in headers.getlist("origin"):
             if origin not in own:
-                return "foreign-origin", f"a page of {origin!r} may not ask this service", None
+                return "foreign-origin", f"requests from pages of {origin!r} are refused", None
         return None
 
     def identity(self, headers: Headers, secure: bool = False) -> Identity | None:
-        """Who asks, over TLS where `secure`; a token that is sent counts alone, not the cookie
-        beside it. Of several cookies the first good one counts."""
+        """The caller, over TLS if `secure`. A token in the header takes precedence over cookies; of
+        several cookies the first valid one counts."""
         if self.tokens is None:
             return ANYBODY
         if "authorization" in headers:
@@ -67,22 +67,21 @@ class Access:
         return next(filter(None, map(self.tokens.behind, behind)), None)
 
     def darkens(self, headers: Headers) -> Identity | None:
-        """Who may black out, and nothing else, by what a page keeps of an earlier login; asks no
-        disk."""
+        """The identity of a page's blackout right, kept from an earlier login; reads no disk."""
         name = self.logins.blackout_by(headers.get(RIGHT, ""))
         return None if name is None else Identity(name=f"{name}, blackout right", scopes=())
 
     def of_token(self, token: str) -> Identity:
-        """Whose token this is. Raises `UnknownToken`."""
+        """The identity of a token. Raises `UnknownToken`."""
         identity = ANYBODY if self.tokens is None else self.tokens.find(token)
         if identity is None:
-            raise UnknownToken("there is no such token; 'hairstage token' shows and makes them")
+            raise UnknownToken("unknown token: 'hairstage token' lists and makes tokens")
         return identity
 
 
 class Gate:
-    """Passes on what `access` lets in; the caller is `identity` in the scope's state. All else is
-    answered with a problem document."""
+    """Passes on requests that `access` allows, with `identity` in the scope's state, and refuses
+    others with a problem document."""
 
     def __init__(self, app: ASGIApp, access: Access, refusals: Refusals | None = None) -> None:
         self._app, self._access, self._refusals = app, access, refusals
@@ -111,12 +110,12 @@ class Gate:
         response = problem_response(scope["path"], slug, detail, status=status, **more)
         if slug == "unauthorized":
             response.headers["www-authenticate"] = "Bearer"
-        await answer(response, scope, receive, send)
+        await refuse(response, scope, receive, send)
 
     def _scope_refusal(
         self, scope: Scope, route: Route | None, darkens: bool
     ) -> tuple[str, str, int | None] | None:
-        """Why whoever asks may not; who it is stands in the scope's state from here on."""
+        """Why the caller may not; sets `identity` in the scope's state."""
         headers = Headers(scope=scope)
         identify = partial(self._access.identity, secure=scope["scheme"] == "https")
         identity = identify(headers)
@@ -128,7 +127,7 @@ class Gate:
         if identity is None:
             detail = (
                 "log in again: the request has neither the header 'Authorization: Bearer TOKEN' "
-                "with a token that is known here, nor the cookie of a login that is not over"
+                "with a valid token, nor the cookie of a valid login"
             )
             return "unauthorized", detail, None
         if route is not None and route.scopes and not route.allows(identity.scopes):
@@ -137,7 +136,7 @@ class Gate:
         return None
 
     def _record(self, scope: Scope, route: Route | None, slug: str, detail: str) -> None:
-        """Have the audit log name who was refused what, where it matters who tried."""
+        """Record a refusal in the audit log, for audited routes."""
         if self._refusals is None or route is None or not route.audited:
             return
         identity, client = scope["state"].get("identity"), scope.get("client")

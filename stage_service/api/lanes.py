@@ -1,4 +1,4 @@
-"""Threads of their own for what must be answered whatever all other requests wait for."""
+"""Separate thread pools, so that urgent requests do not wait for others."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from stage_service.jobs.queue import JobsUnavailable
 P = ParamSpec("P")
 T = TypeVar("T")
 DATABASE_S = 10.0
-"""A job database that has not answered by then counts as away."""
+"""Timeout of the job database."""
 
 
 class Lanes:
-    """By what they may have to wait for; one never waits for the threads of another."""
+    """Thread pools by what their work may wait for."""
 
     def __init__(self) -> None:
         self._dark, self._health, self._devices = (CapacityLimiter(n) for n in (64, 16, 64))
         self._jobs = CapacityLimiter(8)
 
     async def dark(self, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
-        """For abort and blackout, which wait for lamps and projectors alone."""
+        """For abort and blackout, which wait only for lamps and projectors."""
         return await to_thread.run_sync(partial(work, *args, **more), limiter=self._dark)
 
     async def health(self, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
-        """For what waits for nothing."""
+        """For work that does not wait."""
         return await to_thread.run_sync(partial(work, *args, **more), limiter=self._health)
 
     async def devices(self, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
-        """For what gives devices a moment to answer."""
+        """For work that queries devices."""
         return await to_thread.run_sync(partial(work, *args, **more), limiter=self._devices)
 
     async def jobs(self, work: Callable[P, T], *args: P.args, **more: P.kwargs) -> T:
-        """For what asks the job database. Raises `JobsUnavailable` where it takes too long."""
+        """For queries of the job database. Raises `JobsUnavailable` after `DATABASE_S`."""
         try:
             with fail_after(DATABASE_S):
                 return await to_thread.run_sync(
@@ -45,8 +45,9 @@ class Lanes:
                 )
         except TimeoutError:
             raise JobsUnavailable(
-                f"job database or disk has not answered within {DATABASE_S:g} s: what was asked "
-                "may still be done, look before you ask again"
+                f"the job database or disk did not respond within {DATABASE_S:g} s: the request "
+                "may "
+                "still be carried out, check before you repeat it"
             ) from None
 
 

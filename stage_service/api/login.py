@@ -1,4 +1,4 @@
-"""Logins: a browser gives a token once, and then sends a cookie that no page's script can read."""
+"""Logins: a browser sends a token once, then a cookie that scripts cannot read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOGIN = "/login"
 
 
 class LoginRequest(BaseModel):
-    """A token, as `hairstage token` makes and shows them."""
+    """A token, see `hairstage token`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -31,8 +31,8 @@ class LoginRequest(BaseModel):
 
 
 class Who(BaseModel):
-    """Whose token it is ("" where nobody needs one), and what it opens; `blackout` is what a page
-    sends as the header `Hairstage-Blackout` to darken the stage whatever becomes of its login."""
+    """The token's name ("" if none is required) and scopes; a page sends `blackout` as the header
+    `Hairstage-Blackout` to black out the stage even after its login has ended."""
 
     name: str
     scopes: tuple[Scope, ...]
@@ -47,9 +47,9 @@ router = APIRouter(tags=["login"])
 async def log_in(
     body: LoginRequest, request: Request, response: Response, service: OnService
 ) -> Who:
-    """Log a browser in by a token, for 12 hours. The cookie stands for the token; it is sent to
-    this service alone, by its own pages alone, and no script reads it. After some wrong tokens the
-    next login from that address is refused for a while (429, `Retry-After`)."""
+    """Log a browser in by a token, for 12 hours. The cookie represents the token; only this
+    service's pages send it, and scripts cannot read it. After several wrong tokens further logins
+    from that address are refused for some time (429, `Retry-After`)."""
     access = request.app.state.access
     if access.tokens is None:
         return _who(request, access.of_token(body.token))
@@ -69,7 +69,7 @@ async def log_in(
 
 @router.get(LOGIN)
 async def who(request: Request, by: Anybody) -> Who:
-    """Whom the service takes the caller for, by token or cookie, and what that opens."""
+    """The caller's name and scopes, by token or cookie."""
     return _who(request, by)
 
 
@@ -77,42 +77,41 @@ async def who(request: Request, by: Anybody) -> Who:
 async def log_out(
     request: Request, response: Response, by: Anybody, service: OnService
 ) -> Who | Response:
-    """End the login: its cookie opens nothing any more, whoever kept it. The right to a blackout
-    stays."""
+    """End the login and invalidate its cookie. The blackout right stays."""
     access, held = request.app.state.access, cookies(request.headers, _secure(request))
-    answer: Who | Response = _who(request, by)
+    result: Who | Response = _who(request, by)
     try:
         await run_in_threadpool(access.logins.end, held, place(request.headers))
     except logins.NotStored as error:
-        answer = response = problem_response(request.url.path, "not-stored", str(error))
+        result = response = problem_response(request.url.path, "not-stored", str(error))
     await _recorded(service.record_login(by, "logout"))
     response.headers["Set-Cookie"] = _cookie(request, "", 0)
-    return answer
+    return result
 
 
 async def _recorded(line: Future[None]) -> None:
-    """Wait for the line, as everybody does, without a thread."""
+    """Wait for the audit log's line without a thread."""
     with suppress(TimeoutError):
         await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(line)), control.RECORDED_S)
 
 
 def _origin(request: Request) -> str:
-    """What wrong logins are counted by: the page, where its right to a blackout shows that it has
-    once logged in, so that no other program at its address keeps it out; else the address."""
+    """What wrong logins are counted by: the page, if its blackout right proves an earlier login, so
+    that other programs at its address cannot lock it out; else the address."""
     name = request.app.state.access.logins.blackout_by(request.headers.get(RIGHT, ""))
     host = request.client.host if request.client else "this machine"
     return host if name is None else f"a page of {name}"
 
 
 def place(headers: Headers) -> str:
-    """Host and port that a request names, to which a login is bound: a browser sends the cookies of
-    one port to all others of the host."""
+    """Host and port of a request, to which a login is bound: browsers share cookies between
+    ports."""
     return headers.get("host", "").lower()
 
 
 def cookies(headers: Headers, secure: bool) -> list[str]:
-    """What the login cookies of a request hold, as they came: another port of the host may have set
-    one of the same name, with a longer path, which comes first."""
+    """Values of a request's login cookies, in order: another port of the host may have set one of
+    the same name with a longer path, which comes first."""
     name = _name(headers, secure)
     parts = [part.strip() for line in headers.getlist("cookie") for part in line.split(";")]
     return [value for part in parts for key, _, value in [part.partition("=")] if key == name]
@@ -125,15 +124,15 @@ def _who(request: Request, by: Caller | Identity) -> Who:
 
 
 def _cookie(request: Request, held: str, seconds: float) -> str:
-    """`Set-Cookie`; an empty one takes it back."""
+    """`Set-Cookie`; an empty value removes the cookie."""
     over_tls = "; Secure" if _secure(request) else ""
     rules = f"Path=/; Max-Age={seconds:.0f}; HttpOnly; SameSite=Strict{over_tls}"
     return f"{_name(request.headers, _secure(request))}={held}; {rules}"
 
 
 def _name(headers: Headers, secure: bool) -> str:
-    """The cookie's. Over TLS a browser takes `__Host-` from this very host alone, and for TLS; the
-    port is in it, as a browser does not keep those of two ports of one host apart."""
+    """The cookie's name, with the port, because browsers share cookies between ports. Over TLS the
+    prefix `__Host-` binds it to this host."""
     port = headers.get("host", "").rpartition(":")[2]
     name = f"hairstage-{port}" if port.isdigit() else "hairstage"
     return f"__Host-{name}" if secure else name

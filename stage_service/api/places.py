@@ -1,8 +1,7 @@
-"""Places: how much each caller may hold at once, and what is kept for those who steer.
+"""Places: how many connections, streams and requests each caller may hold at once.
 
-A caller counts by its token's name. Of each kind some places are out of reach of all tokens without
-the scope `steer` together, whatever these open, and some out of reach of these and of any one token
-that has it.
+Callers are counted by token name. Of each kind some places are reserved for tokens with the scope
+`steer`, and no single one of these can take all of them.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ Kind = Literal["connections", "streams", "stops", "requests", "uploads", "downlo
 
 @dataclass(frozen=True)
 class Limit:
-    """Places of one kind: `all` of them, `others` for all tokens without `steer` together, `each`
-    for one token without it, `steering` for one token with it. Whoever finds none waits up to
-    `wait_s` seconds. `what` they are, and what to do `instead`, for the refusal."""
+    """Places of one kind: `all`, `others` for all tokens without `steer` together, `each` for one
+    token without it, `steering` for one with it. A caller waits for one up to `wait_s` seconds.
+    `what` and `instead` are the kind and the advice in a refusal."""
 
     all: int
     others: int
@@ -35,36 +34,33 @@ class Limit:
 
 
 LIMITS: dict[Kind, Limit] = {
-    # These and the 112 of `connections.UNNAMED` are half of the descriptors that `select`, and most
-    # systems, allow a process: the capture's files and devices have the other half. A browser opens
-    # up to 6.
+    # With the 112 of `connections.HALL` half of the descriptors that `select` allows a process; the
+    # other half is for the capture's files and devices. A browser opens up to 6.
     "connections": Limit(400, 144, 64, 224, 0, "connections", "close those that are idle"),
-    # One for each open page; each costs about 0.1 ms for each round of news.
+    # One per open page; each costs about 0.1 ms per round of events.
     "streams": Limit(256, 48, 16, 200, 0, "event streams", "close one"),
     # Threads of blackout, abort and hold. The third blackout of a token waits for its first.
-    "stops": Limit(64, 6, 2, 16, 10.0, "stops under way", "wait for their answers"),
-    # Python runs one thread at a time: each that works delays a blackout. The framework has threads
-    # for 40, so that 16 are left for the console's files.
+    "stops": Limit(64, 6, 2, 16, 10.0, "stops under way", "wait for their responses"),
+    # Python runs one thread at a time, so each request delays a blackout. The framework has 40
+    # threads; 16 are left for the console's files.
     "requests": Limit(24, 4, 2, 16, 10.0, "requests at work", "send fewer at a time"),
-    # Each has up to 32 MiB in memory.
+    # Each takes up to 32 MiB of memory.
     "uploads": Limit(4, 1, 1, 2, 10.0, "uploads", "wait until one has ended"),
-    # Each has up to 256 KiB in memory, and a descriptor.
+    # Each takes up to 256 KiB of memory and a descriptor.
     "downloads": Limit(32, 12, 4, 16, 0, "downloads", "read them to their end, or close them"),
-    # They take turns at one process, and trace on every core; a viewer's page sends several.
+    # They share one process, which traces on every core; a viewer's page sends several.
     "renders": Limit(8, 3, 2, 4, 30.0, "renders", "wait until one has ended"),
 }
-"""All limits, and the reason of each."""
 
 FILES: tuple[Kind, ...] = ("connections", "streams")
-"""Of which there are fewer where a process may open few files."""
+"""Kinds that are reduced if the process may open few files."""
 AGAIN_S = 5
-"""When somebody who was refused may find a place: an answer that nobody takes is ended by then."""
+"""Retry-After of a refusal, seconds: by then stalled responses have been ended."""
 
 
 @dataclass(frozen=True)
 class Owner:
-    """Whose a place is: a token's, by its name, or that of all who sent none from one `address`;
-    and whether it may steer the stage."""
+    """The owner of a place: a token's `name`, or all callers without one at an `address`."""
 
     name: str = ""
     address: str = ""
@@ -72,7 +68,7 @@ class Owner:
 
     @classmethod
     def of(cls, identity: Identity | None, client: tuple[str, int] | None) -> Self:
-        """The owner of what somebody of this identity opens at this address."""
+        """The owner of the requests of this identity and client address."""
         if identity is None:
             return cls(address=client[0] if client else "this machine")
         return cls(identity.name, steers="steer" in identity.scopes)
@@ -80,20 +76,20 @@ class Owner:
     def __str__(self) -> str:
         if self.name:
             return f"token {self.name!r}"
-        return f"{self.address} without a token" if self.address else "everybody together"
+        return f"{self.address} without a token" if self.address else "all callers together"
 
 
 class NoPlace(RuntimeError):
-    """There is no place; the message says which limit, how many the caller has, and what to do.
+    """No place is free; the message has the limit, the caller's count, and what to do.
 
-    `status` is 429 where the caller's own limit is reached, 503 where others have the places.
+    `status` is 429 if the caller's own limit is reached, 503 if others have the places.
     """
 
     def __init__(self, limit: Limit, owner: Owner, held: int) -> None:
         most = limit.steering if owner.steers else limit.each
         self.status = 429 if held >= most else 503
         if held >= most:
-            why = f"{owner} has {held} {limit.what}, of {most} that it may have"
+            why = f"{owner} has {held} of at most {most} {limit.what}"
         elif owner.steers:
             why = f"all {limit.all} {limit.what} are taken; {owner} has {held} of them"
         else:
@@ -105,10 +101,10 @@ class NoPlace(RuntimeError):
 
 
 class Places:
-    """Who has how much of each kind. For one event loop, and no other thread."""
+    """Places in use by kind and owner. For one event loop only."""
 
     def __init__(self, share: float = 1.0) -> None:
-        """With this share of connections and streams, where the process may open few files."""
+        """`share` reduces connections and streams if the process may open few files."""
         self._share = share
         self._held: dict[Kind, Counter[Owner]] = {kind: Counter() for kind in LIMITS}
         self._waiting: dict[Kind, dict[Owner, deque[asyncio.Future[None]]]] = {
@@ -116,23 +112,23 @@ class Places:
         }
 
     def held(self, kind: Kind, owner: Owner | None = None) -> int:
-        """How many there are of a kind: of one owner, or of all."""
+        """Number of places in use of a kind, by one owner or by all."""
         found = self._held[kind]
         return found.total() if owner is None else found[owner]
 
     def lacks(self, kind: Kind, owner: Owner) -> NoPlace | None:
-        """Why the owner would have no place now."""
+        """Why the owner would get no place now; None if it would."""
         free = self._free(kind, owner)
         return None if free else NoPlace(self._limit(kind), owner, self._held[kind][owner])
 
     def take(self, kind: Kind, owner: Owner) -> None:
-        """Take a place, to be given back by `leave`. Raises `NoPlace`."""
+        """Take a place until `leave`. Raises `NoPlace`."""
         if (refusal := self.lacks(kind, owner)) is not None:
             raise refusal
         self._held[kind][owner] += 1
 
     async def wait(self, kind: Kind, owner: Owner) -> None:
-        """Take a place once there is one. Raises `NoPlace` after the kind's `wait_s` seconds."""
+        """Take a place when one is free. Raises `NoPlace` after the kind's `wait_s` seconds."""
         if self._free(kind, owner):
             self._held[kind][owner] += 1
             return
@@ -143,7 +139,7 @@ class Places:
             async with asyncio.timeout(self._limit(kind).wait_s):
                 await granted
         except BaseException as error:
-            if granted.done() and not granted.cancelled():  # it was given one at that moment
+            if granted.done() and not granted.cancelled():  # granted at that moment
                 self.leave(kind, owner)
             elif granted in queue:
                 queue.remove(granted)
@@ -155,8 +151,8 @@ class Places:
                 del self._waiting[kind][owner]
 
     def leave(self, kind: Kind, owner: Owner) -> None:
-        """Give a place back: to whoever waits and may have it, those who steer first, then the
-        owner that has fewest."""
+        """Free a place and give it to a waiting owner: with `steer` first, then the one with
+        fewest."""
         held, waiting = self._held[kind], self._waiting[kind]
         held[owner] -= 1
         if not held[owner]:
@@ -169,7 +165,7 @@ class Places:
 
     @contextmanager
     def holding(self, kind: Kind, owner: Owner) -> Iterator[None]:
-        """A place for as long as the block. Raises `NoPlace`."""
+        """Hold a place during the block. Raises `NoPlace`."""
         self.take(kind, owner)
         try:
             yield
@@ -191,14 +187,14 @@ class Places:
 
 
 def _first(queue: deque[asyncio.Future[None]]) -> bool:
-    """Whether somebody still waits there; takes out those who have just given up."""
+    """Whether a waiter is left; removes those that have given up."""
     while queue and queue[0].done():
         queue.popleft()
     return bool(queue)
 
 
 def _part(limit: Limit, share: float) -> Limit:
-    """The limit for fewer places, of which some are still kept."""
+    """The limit scaled by `share`, at least 1 each."""
     return replace(
         limit,
         all=max(1, int(share * limit.all)),

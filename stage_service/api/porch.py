@@ -1,10 +1,9 @@
-"""The porch: connections whose first request has not been read yet.
+"""The porch: accepted connections whose first request has not been read yet.
 
-Each is accepted at once, so that none waits behind others in the kernel, and takes a few dozen
-microseconds of the event loop until its first request is there. Then it is known whose it is: it
-goes in, or is held until its owner has a place and a turn, and refused where that takes too long.
-Refusing late is part of it: whoever opens a new connection for each that was refused does so once
-in `HELD_S` for each socket.
+Connections are accepted at once, so that none waits in the kernel; each costs some 10 µs of the
+event loop until its first request has arrived. Its owner is then known: it is admitted, or held
+until the owner has a place and a turn, or refused after `HELD_S`. The late refusal limits clients
+that reconnect after each one.
 """
 
 from __future__ import annotations
@@ -21,24 +20,23 @@ from dataclasses import dataclass
 from stage_service.api.connections import HALL, HEADER_S, MOST_HEADER_BYTES
 
 MOST, LOWEST = 4096, 1024
-"""Connections on the porch, where the process may open `MOST + LOWEST` files and more; else there
-are `HALL`. Their descriptors are above `LOWEST`: those below are all that `select` can watch, and
-are left to the stage's devices."""
+"""Connections on the porch if the process may open `MOST + LOWEST` files, else `HALL`. Their
+descriptors are above `LOWEST`: lower ones, which `select` needs, are left to the stage's
+devices."""
 AT_ONCE = 128
-"""Connections that are accepted before the event loop turns to something else."""
+"""Connections that are accepted in one pass of the event loop."""
 HELD_S = 5.0
-"""Who has had no place and no turn within this time is refused."""
+"""A connection without a place and a turn within this time is refused."""
 LINGER_S = 2.0
-"""How long a client that is refused may go on sending, lest it lose the answer."""
+"""How long a refused client may continue to send, so that it receives the refusal."""
 PACE_S, SHOOTING_PACE_S = 5e-3, 50e-3
-"""From one connection that has waited for its turn to the next; the second while a capture is shot:
-one takes about 0.5 ms of the event loop."""
+"""Seconds between admissions of held connections, and during a capture; one takes about 0.5 ms."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What becomes of a connection: it goes in at once, or in its `owner`'s turn as soon as `may()`
-    allows it; until then `refusal()` is what it would be answered."""
+    """Verdict on a connection: it is admitted at once, or in its `owner`'s turn once `may()` is
+    true; `refusal()` is the response if that takes too long."""
 
     owner: object
     at_once: bool
@@ -55,8 +53,8 @@ class _Guest:
 
 
 class Porch:
-    """Accepts connections, has each judged by the head of its first request and the client's
-    address, and hands over those that may go in. For one event loop, and no other thread."""
+    """Accepts connections, judges each by the head of its first request and the client's address,
+    and admits those allowed. For one event loop only."""
 
     def __init__(
         self,
@@ -67,8 +65,8 @@ class Porch:
         *,
         encrypted: bool = False,
     ) -> None:
-        """With `encrypted` there is no head to read: the judge is given none. `files` is how many
-        the process may open."""
+        """With `encrypted` connections the judge gets an empty head. `files` is the process's limit
+        of open files."""
         self._judge, self._admit, self._shooting = judge, admit, shooting
         self._encrypted = encrypted
         self._high = files >= MOST + LOWEST
@@ -85,14 +83,14 @@ class Porch:
         self._sweep = self._loop.call_later(HEADER_S / 10, self._end_late)
 
     def listen(self, listener: socket.socket, queued: int) -> None:
-        """Accept what comes there from now on."""
+        """Accept connections of `listener` from now on."""
         listener.setblocking(False)
         listener.listen(queued)
         self._listeners.append(listener)
         self._loop.add_reader(listener.fileno(), self._accept, listener)
 
     def close(self) -> None:
-        """Accept nothing more, and end what is here."""
+        """Stop accepting, and close all connections here."""
         for listener in self._listeners:
             self._loop.remove_reader(listener.fileno())
         self._loop.remove_reader(self._poll.fileno())
@@ -127,8 +125,8 @@ class Porch:
         return len(self._silent) + len(self._refused) + sum(map(len, self._held.values()))
 
     def _make_room(self) -> None:
-        """End the one that has said nothing for longest, once all that has come is read; else the
-        one that was refused first, or has been held for longest."""
+        """End the connection that has been silent for longest, else the one refused first, else the
+        one held for longest."""
         self._look()
         for guests in (self._silent, self._refused):
             if guests:
@@ -139,7 +137,7 @@ class Porch:
             self._end(min(queues, key=lambda queue: queue[0].since).popleft())
 
     def _look(self) -> None:
-        """See to whatever has sent something, or gone."""
+        """Process connections that have sent something or closed."""
         for number, _ in self._poll.poll(0):
             if (guest := self._silent.get(number)) is not None:
                 self._read(guest)
@@ -178,8 +176,7 @@ class Porch:
             self._turn = self._loop.call_at(self._let_in + pace, self._let_one_in)
 
     def _let_one_in(self) -> None:
-        """Let one in whose owner may: owners take turns, and the newest of each is first, whose
-        client still waits."""
+        """Admit one connection: owners take turns; of each the newest, whose client still waits."""
         self._turn, self._let_in = None, self._loop.time()
         for owner in list(self._held):
             guests = self._held.pop(owner)
@@ -194,7 +191,7 @@ class Porch:
         self._next_turn()
 
     def _end_late(self) -> None:
-        """End who has said nothing in time, and refuse who was held for too long."""
+        """End connections that were silent for too long; refuse those held for too long."""
         now = self._loop.time()
         self._sweep = self._loop.call_later(HEADER_S / 10, self._end_late)
         for guests, most_s in ((self._silent, HEADER_S), (self._refused, LINGER_S)):
@@ -223,15 +220,15 @@ class Porch:
 
 
 def _above(link: socket.socket) -> socket.socket:
-    """The same connection by a descriptor that is left free by `select`'s."""
+    """The same connection with a descriptor above `select`'s."""
     number = fcntl.fcntl(link.fileno(), fcntl.F_DUPFD_CLOEXEC, LOWEST)
     link.close()
     return socket.socket(fileno=number)
 
 
 def _drained(link: socket.socket) -> bool:
-    """Forget what was sent; whether the client has gone. What is closed with unread bytes is reset,
-    and an answer is lost with it."""
+    """Discard what was sent; whether the client has gone. A connection closed with unread bytes is
+    reset and loses the response."""
     try:
         for _ in range(16):
             if not link.recv(1 << 16):

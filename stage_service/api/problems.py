@@ -1,4 +1,4 @@
-"""Errors as problem documents (RFC 9457), one table for all of them."""
+"""Errors as problem documents (RFC 9457), defined in one table."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ from stage_service.watching import NotReady
 log = logging.getLogger("hairstage.api")
 PAGE = "/docs/errors.md"
 MOST_ERRORS = 20
-"""Fields that an answer lists: a list of 60,000 wrong ones would take seconds to tell."""
+"""Invalid fields that a response lists: 60,000 would take seconds to send."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of problem: its anchor in the errors page, its status, and what to do about it."""
+    """A kind of problem: anchor in the errors page, status, title, and what to do."""
 
     slug: str
     status: int
@@ -66,121 +66,119 @@ class Kind:
 
 
 TABLE = """
-unauthorized 401 Who asks is not known
+unauthorized 401 The caller is not authenticated
     Every request but those for /docs and /openapi.json carries `Authorization: Bearer TOKEN`, or
-    the cookie that `POST /login` sets. `hairstage token` makes tokens; docs/how-to/safety.md says
-    who may do what.
+    the cookie that `POST /login` sets. `hairstage token` makes tokens; docs/how-to/safety.md
+    lists their scopes.
 forbidden 403 This token does not allow that
-    `scope` is what it lacks. Abort and blackout are open to every token.
-foreign-origin 403 A web page of another site asked
-    A browser sent this for a page that is not this service's own.
+    `scope` is the missing scope. Abort and blackout need none.
+foreign-origin 403 The request comes from a web page of another site
+    The header `Origin` is not this service's.
 too-many-logins 429 Wait before you log in again
-    Too many wrong tokens came from this address. `Retry-After` has the seconds. No other address
-    waits for that, no token that is sent with each request, and no blackout.
-no-place 429 The caller has as many as they may have
-    Connections, event streams, uploads, downloads, renders and requests at work are counted by
-    token, and some are kept for tokens with the scope `steer`. `detail` says which limit it is,
-    how many the token has, and what to do; the header `Retry-After` says when to try again. With
-    the status 503 others have what there is, or a capture is being shot. Abort and blackout are
-    answered all the same.
+    Too many wrong tokens came from this address. `Retry-After` has the seconds. Other addresses,
+    requests with a token, and blackouts are not affected.
+no-place 429 The caller has reached a limit
+    Connections, event streams, uploads, downloads, renders and concurrent requests are counted by
+    token, and some are reserved for tokens with the scope `steer`. `detail` names the limit, the
+    token's count, and what to do; the header `Retry-After` has the seconds. With the status 503
+    other callers have all places, or a capture is running. Abort and blackout are not affected.
 too-large 413 The request is too large
-    `detail` says what is allowed.
+    `detail` has the limit.
 invalid-request 422 The request does not fit the schema
-    `errors` lists each field that is wrong and why. The schema is in /openapi.json.
+    `errors` lists each invalid field with the reason. The schema is in /openapi.json.
 invalid-plan 422 This rig cannot shoot this plan
-    `problems` has one sentence for each reason. No lamp was touched. Correct the plan and try
-    it with `POST /plans:validate`.
+    `problems` lists the reasons. No lamp was lit. Correct the plan and check it with
+    `POST /plans:validate`.
 bad-input 422 A file or name in the request cannot be used
-    `detail` names it and says what was expected, or which limit it goes beyond. Paths are those of
-    the service's machine.
+    `detail` names it, with what was expected or the limit that it exceeds. Paths are those of the
+    service's machine.
 busy 409 Another capture is running
-    The stage makes one capture at a time. Wait for `running`, or abort it.
-not-now 409 Light may not be put on now
-    `detail` says why: the service ends, the stage is put dark or was since the request came,
-    nobody knows yet whether it is dark, or the request is too old. Ask again when that is over.
+    The stage runs one capture at a time. Wait for `running`, or abort it.
+not-now 409 Light is not permitted now
+    `detail` has the reason: the service is stopping, a blackout is running or came after the
+    request, it is not yet known whether the stage is dark, or the request is too old. Repeat the
+    request later.
 hold-changed 409 The queue is held for another reason
-    `held` says why, and something has happened since you read it. Send `hold` once you have read
-    it: `POST /queue:go-on`.
-not-recorded 507 The disk did not take what has to last
-    Who steers, and who answers for flashes, is on the disk before it counts. `detail` names the
-    file and the disk's error; nothing has changed.
+    `held` has the present reason, which is newer than the one you confirmed. Read it, then send
+    `hold` with `POST /queue:go-on`.
+not-recorded 507 The audit log could not be written
+    The lease and the person responsible for flashes are recorded on disk before they take effect.
+    `detail` names the file and the disk's error; nothing has changed.
 stage-in-use 409 Another service has this stage
-    `detail` says which. Stop it; where its machine is dead, start this one with `--take-over`.
+    `detail` names it. Stop it; if its machine is dead, start this one with `--take-over`.
 no-stage 409 The rig file names no devices
-    Nothing can be shot or darkened from here. Start the service with a rig file that has
-    `[devices]`, or with `--devices`.
+    This service cannot make captures or blackouts. Start it with a rig file that has `[devices]`,
+    or with `--devices`.
 flash-rate 422 A living subject would see flashes of 3 to 30 Hz
-    `problems` has the ways out: a slower plan, or recorded consent that somebody at the stage
-    arms. docs/how-to/safety.md says why. No lamp was touched.
-unsafe 409 Nobody knows whether the lamps are off
-    The last blackout could not be verified. Look at the stage, put `detail` right, then `POST
-    /devices/blackout`; where the link cannot read back, `POST /devices/acknowledge`.
-cannot-acknowledge 409 This is not for a person to say
-    Nothing is latched, or the light bank can tell by itself: `POST /devices/blackout`.
-unknown-entry 404 Nothing of that name waits
-    `GET /queue` lists what waits, `GET /queue/history` what was started from it.
-queue-full 409 The queue has no room
-    Remove what waits, or name lights by a rule and not one by one.
-in-use 409 A job still needs it
-    `detail` names the job, or the file that one has just put away. Wait until it is done, or
+    `problems` lists the alternatives: a slower plan, or recorded consent that a person at the stage
+    arms. The reason is in docs/how-to/safety.md. No lamp was lit.
+unsafe 409 It is unknown whether the lamps are off
+    The last blackout could not be verified. Inspect the stage, remove the cause in `detail`, then
+    `POST /devices/blackout`; if the link cannot read back, `POST /devices/acknowledge`.
+cannot-acknowledge 409 A person cannot acknowledge this
+    Nothing is latched, or the light bank can read back: `POST /devices/blackout`.
+unknown-entry 404 No such queued capture
+    `GET /queue` lists queued captures, `GET /queue/history` started and removed ones.
+queue-full 409 The queue is full
+    Remove queued captures, or select lights by a rule instead of by name.
+in-use 409 A job uses it
+    `detail` names the job, or the file that a job has just removed. Wait until it is done, or
     cancel it.
 not-removed 409 Some of the trash could not be deleted
-    All else was. `problems` names each entry that is left and the disk's error; put that right and
-    empty the trash again.
+    `problems` names each remaining entry and the disk's error; remove the cause and empty the trash
+    again.
 leads-outside 409 A link leads out of the store
-    `detail` names the link and where it leads: nothing is read through it. Put the folder or file
-    itself there, or remove the link with DELETE, which leaves alone what it leads to.
-not-there 404 No such thing in the store
-    `GET /models`, `/uploads` and `/trash` list what there is.
-disk-full 507 The disk has no room
-    `detail` says how much is needed. `DELETE /trash` makes room.
-not-stored 507 The disk did not take it
-    It counts until the service ends. `detail` says what it means and what to do.
-leased 409 Somebody else steers the stage
-    `holder` has the lease until `expires`. Wait, or ask them. Abort and blackout are open to
-    everybody.
-no-lease 409 The token is no lease's
-    The lease has expired or was released. `GET /lease` says who holds one now.
+    `detail` names the link and its target, which is not read. Put the folder or file itself there,
+    or remove the link with DELETE, which keeps the target.
+not-there 404 No such entry in the store
+    `GET /models`, `/uploads` and `/trash` list the entries.
+disk-full 507 The disk is full
+    `detail` has the bytes needed. `DELETE /trash` frees space.
+not-stored 507 The disk could not store it
+    It is in effect until the service ends. `detail` has the consequence and what to do.
+leased 409 Another caller holds the lease
+    `holder` has the lease until `expires`. Wait, or contact them. Abort and blackout need no lease.
+no-lease 409 The lease's token is not valid
+    The lease has expired or was released. `GET /lease` has the present holder.
 journal-in-use 409 The capture is being written or compressed
-    Wait until that is done; `GET /jobs` shows a compression.
+    Wait for its end; `GET /jobs` lists compressions.
 wrong-state 409 The capture's state does not allow this
-    `detail` lists what is possible now; `state` is where the capture is. Steps that the
-    trigger box clocks cannot pause.
+    `detail` lists the possible actions, `state` is the capture's state. Steps that the trigger box
+    clocks cannot be paused.
 not-finished 409 The capture is not finished
-    Wait until its state is `done`; only a capture that completed can be processed, so resume
-    one that did not.
+    Wait until its state is `done`. Only completed captures can be processed: resume an incomplete
+    one.
 model-in-use 409 Another job makes this model
-    Wait until it is done, cancel it, or name another model.
-key-used 409 This Idempotency-Key stands for another request
-    `detail` names the job. A key is its caller's own, and of one request: send another key.
+    Wait for its end, cancel it, or name another model.
+key-used 409 This Idempotency-Key belongs to another request
+    `detail` names the job. A key is valid for one caller and one request: send another key.
 unknown-capture 404 No such capture
     `GET /captures` lists the captures.
 unknown-frame 404 No such step or camera
-    `detail` says which steps and cameras this capture has.
+    `detail` lists the steps and cameras of this capture.
 missing-frame 404 The frame is missing
-    It was planned and did not come, or has not been shot yet; `detail` says which.
+    It was planned and did not arrive, or has not been shot yet; `detail` has the reason.
 unknown-job 404 No such job
     `GET /jobs` lists the jobs.
 unknown-artifact 404 No such file in the model folder
-    `GET /jobs/{id}/artifacts` lists the files. Paths that lead out of the folder are not
-    followed.
-jobs-unavailable 503 The job database does not answer
-    Captures, blackout and abort do not need it. `GET /health` says what is wrong; what
-    completed captures were asked to be followed by is enqueued once it answers.
+    `GET /jobs/{id}/artifacts` lists the files. Paths out of the folder are refused.
+jobs-unavailable 503 The job database does not respond
+    Captures, blackout and abort do not need it. `GET /health` has the reason; jobs of completed
+    captures are enqueued when it responds again.
 decoder-busy 503 Other files are being decoded
-    Pictures, meshes and maps are decoded in a process of its own, a few at a time. Ask again in
-    some seconds.
-not-ready 503 No capture could begin
-    `problems` has a sentence for each reason. A capture that runs is none.
+    Images, meshes and maps are decoded in a separate process, a few at a time. Repeat the request
+    after some seconds.
+not-ready 503 No capture could start
+    `problems` lists the reasons. A running capture is none of them.
 damaged-capture 409 The capture folder cannot be read
-    `detail` names the file. `hairstage verify CAPTURE` lists everything that is wrong.
+    `detail` names the file. `hairstage verify CAPTURE` lists all damaged files.
 http 400 The request cannot be served
-    The status says why: no such route, method not allowed, a host name that is not this
-    service's, or a request that took too long to come.
-internal 500 A fault in the service
-    The service's log has the traceback. Lamps go off by themselves if the service dies.
+    The status has the reason: no such route, method not allowed, a host name that is not this
+    service's, or a request that took too long to arrive.
+internal 500 An internal error of the service
+    The service's log has the traceback. If the service dies, the watchdog puts the lamps off.
 """
-"""Each kind's anchor, status and title, and below them what to do about it."""
+"""Anchor, status and title of each kind, then what to do."""
 
 
 def _kinds() -> Iterator[Kind]:
@@ -239,16 +237,16 @@ BY_ERROR: dict[type[Exception], str] = {
     NotReady: "not-ready",
     CaptureError: "damaged-capture",
 }
-"""Which error class becomes which kind; a subclass stands before its base."""
+"""Kind by error class, subclasses before their bases."""
 
 WHO_MAY = {"unauthorized", "forbidden", "too-many-logins"}
-"""Kinds that are about who asks: the gate has them audited."""
+"""Kinds about the caller, which the gate records in the audit log."""
 EXTRA = ("problems", "running", "state", "holder", "expires", "scope", "held", "hold")
-"""Attributes of an error that its problem document repeats."""
+"""Attributes of errors that are copied to the problem document."""
 
 
 class Problem(BaseModel):
-    """An error as RFC 9457 has it; `type` leads to its paragraph of the errors page."""
+    """An error (RFC 9457); `type` is the path of its paragraph in the errors page."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -286,7 +284,7 @@ def problem_response(
         "instance": path,
         **extra,
     }
-    # In ASCII, so that no text that an error quotes can keep it from being told.
+    # ASCII, so that any text an error quotes can be sent
     text = json.dumps(content)
     return Response(text, content["status"], media_type="application/problem+json")
 
@@ -307,9 +305,9 @@ def errors_page() -> str:
 
 
 class Faults:
-    """Answers a fault of the service with a problem document, and keeps the connection.
+    """Responds to internal errors with a problem document and keeps the connection.
 
-    The framework's own handler answers and then raises again, upon which the server closes the
+    The framework's handler raises again after its response, and the server then closes the
     connection under the client's next request.
     """
 
@@ -317,7 +315,7 @@ class Faults:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on; raises only where half an answer has gone out already."""
+        """Pass the request on; raises only if a part of the response has been sent."""
         begun = False
 
         async def sending(message: Message) -> None:
@@ -336,7 +334,7 @@ class Faults:
 
 
 def install_problems(app: FastAPI) -> None:
-    """Make every error of `app` that is known a problem document; `Faults` does for the others."""
+    """Respond to the errors of `BY_ERROR` with problem documents; `Faults` handles others."""
 
     async def known(request: Request, error: Exception) -> Response:
         slug = next(s for e, s in BY_ERROR.items() if isinstance(error, e))

@@ -1,4 +1,4 @@
-"""The routes. Each calls one function of `Service`; errors become problems in `problems`."""
+"""Routes of captures, jobs and the service."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ reading = APIRouter(dependencies=READS)
 
 @reading.post("/plans:validate", tags=["captures"])
 def validate_plan(plan: CapturePlan, service: OnService) -> PlanCost:
-    """What a plan would take on this rig: frames, bytes, seconds, light dose. Lights nothing."""
+    """Cost of a plan on this rig: frames, bytes, seconds, light dose. Lights no lamp."""
     return service.validate(plan)
 
 
@@ -46,7 +46,7 @@ def validate_plan(plan: CapturePlan, service: OnService) -> PlanCost:
 def start_capture(
     body: CaptureRequest, service: OnService, by: Steers, response: Response
 ) -> CaptureView:
-    """Begin a capture. With `pipeline`, its completion enqueues that job by itself."""
+    """Start a capture. With `pipeline`, its completion enqueues that job."""
     view = service.start_capture(body, by)
     response.headers["Location"] = f"/captures/{view.id}"
     return view
@@ -54,8 +54,8 @@ def start_capture(
 
 @router.post("/snapshot", status_code=status.HTTP_202_ACCEPTED, tags=["captures"])
 def take_snapshot(body: SnapshotRequest, service: OnService, by: Steers) -> CaptureView:
-    """Begin one exposure to look at. It is the capture "snapshot" until the next one, in no list
-    of captures, and can be asked for its frames like any."""
+    """Take one exposure for viewing. It is the capture "snapshot" until the next one; it is not
+    listed, and its frames are served as those of any capture."""
     return service.snapshot(body, by)
 
 
@@ -64,25 +64,25 @@ def list_captures(
     service: OnService,
     response: Response,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
-    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
+    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones skipped")] = 0,
     outcome: Annotated[Outcome | None, Query(description="only these")] = None,
 ) -> list[CaptureView]:
-    """The latest captures, the oldest of them first. After a start the folders are read, the newest
-    first: the header `Hairstage-Unread` says how many are to come, and the event "captures.read"
-    that none is."""
+    """The latest captures, the oldest of them first. After a start the service reads the folders,
+    the newest first: the header `Hairstage-Unread` has the number of unread ones; the event
+    "captures.read" follows the last."""
     response.headers["Hairstage-Unread"] = str(service.unread)
     return service.captures(limit, offset, outcome)
 
 
 @reading.get("/captures/{capture}", tags=["captures"])
 def get_capture(capture: str, service: OnService) -> CaptureView:
-    """Where a capture is, how it ended, and the job that follows it."""
+    """State and outcome of a capture, and its job."""
     return service.capture(capture)
 
 
 @reading.get("/captures/{capture}/steps", tags=["captures"])
 def get_steps(capture: str, service: OnService) -> list[StepView]:
-    """What a capture shoots, in order: which step is which light."""
+    """Steps of a capture in order, with their lights."""
     return service.frames.steps(capture)
 
 
@@ -96,7 +96,7 @@ def pause_capture(capture: str, service: OnService, by: Steers) -> CaptureView:
 def resume_capture(
     capture: str, service: OnService, by: Steers, body: ResumeRequest | None = None
 ) -> CaptureView:
-    """Go on after a pause; of a capture that did not complete, shoot the frames that it lacks."""
+    """Resume after a pause; shoot the missing frames of an incomplete capture."""
     return service.resume(capture, by, None if body is None else body.armed_by)
 
 
@@ -131,15 +131,20 @@ def get_preview(
     step: int,
     camera: str,
     service: OnService,
-    percentile: Annotated[float, Query(ge=50, le=100, description="what becomes white")] = 99.5,
+    percentile: Annotated[
+        float, Query(ge=50, le=100, description="percentile that becomes white")
+    ] = 99.5,
     white: Annotated[
-        float | None, Query(ge=1e-30, le=1e30, description="this does instead, W/(sr m²)")
+        float | None,
+        Query(ge=1e-30, le=1e30, description="radiance that becomes white instead, W/(sr m²)"),
     ] = None,
-    size: Annotated[int | None, Query(ge=8, le=4096, description="of the longer side")] = None,
-    mark: Annotated[bool, Query(description="paint what is saturated")] = False,
+    size: Annotated[
+        int | None, Query(ge=8, le=4096, description="pixels of the longer side")
+    ] = None,
+    mark: Annotated[bool, Query(description="mark saturated pixels")] = False,
 ) -> Response:
-    """A picture of a frame to look at: exposed by a percentile, or by what is said to be white, so
-    that frames can be compared; sRGB, made smaller where `size` says so."""
+    """An sRGB preview of a frame, exposed by a percentile, or by `white` so that frames can be
+    compared, reduced to `size`."""
     look = {"percentile": percentile, "white": white, "size": size, "mark": mark}
     picture = service.frames.preview(capture, step, camera, **look)
     return Response(picture, media_type="image/png")
@@ -147,7 +152,7 @@ def get_preview(
 
 @reading.get("/captures/{capture}/frames/{step}/{camera}.json", tags=["captures"])
 def get_figures(capture: str, step: int, camera: str, service: OnService) -> FrameFigures:
-    """How a frame is exposed, and how sharp it is."""
+    """Exposure and sharpness of a frame."""
     return service.frames.figures(capture, step, camera)
 
 
@@ -160,8 +165,8 @@ async def submit_job(
     response: Response,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=200)] = None,
 ) -> Job:
-    """Enqueue a pipeline on a finished capture. Sent again by the same caller with the same
-    `Idempotency-Key`, it is the same job; a key of another request is 409."""
+    """Enqueue a pipeline on a finished capture. Repeated by the same caller with the same
+    `Idempotency-Key` it returns the same job; a key of another request is 409."""
     job = await lanes.jobs(service.jobs.submit, body, by, idempotency_key)
     response.headers["Location"] = f"/jobs/{job.id}"
     return job
@@ -172,7 +177,7 @@ async def list_jobs(
     service: OnService,
     lanes: OnLanes,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
-    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones left out")] = 0,
+    offset: Annotated[int, Query(ge=0, le=10**9, description="newer ones skipped")] = 0,
 ) -> list[Job]:
     """The latest jobs, newest first."""
     return await lanes.jobs(service.jobs.latest, limit, offset)
@@ -192,7 +197,7 @@ async def cancel_job(job: str, service: OnService, lanes: OnLanes, by: Processes
 
 @reading.get("/jobs/{job}/report", response_class=FileResponse, responses=RANGES, tags=["jobs"])
 async def get_report(job: str, service: OnService, lanes: OnLanes) -> Response:
-    """The report that the job's stages filled: seconds, error against time, left out, warnings."""
+    """The job's report: seconds, error against time, skipped work, warnings by stage."""
     file = await lanes.jobs(service.jobs.artifact, job, "report.json")
     return file_response(file, "application/json")
 
@@ -212,8 +217,8 @@ async def list_artifacts(job: str, service: OnService, lanes: OnLanes) -> list[A
 async def get_artifact(
     job: str, path: str, request: Request, service: OnService, lanes: OnLanes
 ) -> Response:
-    """One file of the model folder. A browser shows pictures, JSON and, without scripts, the page
-    `index.html`; all else it saves."""
+    """A file of the model folder. Browsers show images, JSON and, without scripts, `index.html`,
+    and save other files."""
     file = await lanes.jobs(service.jobs.artifact, job, path)
     if path == PAGE:
         response = file_response(file, "text/html; charset=utf-8")
@@ -228,19 +233,19 @@ async def get_artifact(
 
 @reading.get("/rig", tags=["service"])
 async def get_rig(service: OnService) -> RigView:
-    """Where lights, cameras and projectors stand, and the rig file's defaults."""
+    """Positions of lights, cameras and projectors, and the rig file's defaults."""
     return service.rig()
 
 
 @reading.get("/health", tags=["service"])
 async def health(service: OnService, lanes: OnLanes) -> Health:
-    """How service, lamps and jobs are, as far as is known; asks no device and no database."""
+    """Last known state of service, lamps and jobs; queries no device and no database."""
     return await lanes.health(service.health)
 
 
 @reading.get("/ready", tags=["service"])
 async def ready(service: OnService, lanes: OnLanes) -> dict[str, bool]:
-    """Whether a capture could begin, were none running: 503 where not, with the reasons. Asks no
+    """Whether a capture could start if none is running; 503 with the reasons if not. Queries no
     device and no database."""
     await lanes.health(service.ready)
     return {"ready": True}
@@ -248,6 +253,6 @@ async def ready(service: OnService, lanes: OnLanes) -> dict[str, bool]:
 
 @reading.get("/metrics", response_class=PlainTextResponse, tags=["service"])
 async def metrics(service: OnService, lanes: OnLanes) -> Response:
-    """Figures for Prometheus. Asks no device and no database: how old theirs are is a figure."""
+    """Metrics for Prometheus, with their age. Queries no device and no database."""
     text = await lanes.health(lambda: text_of(service.watching.metrics()))
     return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")

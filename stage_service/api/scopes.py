@@ -1,4 +1,4 @@
-"""Who may call which route: one table, which the gate enforces before it reads a request's body."""
+"""Scopes of the routes, enforced by the gate before it reads a request's body."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ TABLE = """
 open         GET     / /docs /docs/errors.md /favicon.ico /openapi.json /web/{name}
 open         GET     /view /view/page/{file}
 open!        POST    /login
-    The pages and the API's description hold nothing of a stage. A login is how one gets a scope.
+    The pages and the API's description contain no data of a stage. A login grants scopes.
 any          GET     /login
 any          POST    /logout
 any!         POST    /devices/blackout
 any!         POST    /captures/{capture}/abort /queue:hold
-    Darkness harms nobody, so every token may cause it. A held queue and an aborted capture light
-    nothing either; what they held up goes on by `steer`.
+    Darkness is safe, so every token may cause it. Resuming a held queue or an aborted capture needs
+    `steer`.
 read         GET     /health /ready /metrics /rig /events /audit /lease /devices
 read         GET     /captures /captures/{capture} /captures/{capture}/steps
 read         GET     /captures/{capture}/frames/{step}/{camera}.exr
@@ -36,24 +36,23 @@ read         POST    /plans:validate
 read         GET     /view/models /view/models/{name} /view/models/{name}/strands/{which}
 read         GET     /view/models/{name}/head /view/models/{name}/confidence
 read         GET     /view/models/{name}/lighting /view/models/{name}/table
-read         GET     /view/models/{name}/seen/{light} /view/models/{name}/environments/{which}
-read         POST    /view/models/{name}/few /view/models/{name}/indirect
-read         POST    /view/models/{name}/indirect/view /view/models/{name}/sums/{camera}.png
-    A viewer's renders and the light that it bakes show a model and change nothing: who may see the
-    model may see it lit. How many at once is a matter of places, not of scopes.
+read         GET     /view/models/{name}/visibility/{light} /view/models/{name}/environments/{which}
+read         POST    /view/models/{name}/few /view/models/{name}/indirect/view
+read         POST    /view/models/{name}/sums/{camera}.png
+    Renders of a viewer change nothing; their number is limited by places, not scopes.
 jobs|steer!  PUT     /view/models/{name}/environments/{file}
-    A map from elsewhere is decoded by the service: who only looks gives it nothing to decode.
+    The service decodes the map, so `read` does not suffice.
 steer!       POST    /captures /captures/{capture}/pause /captures/{capture}/resume /snapshot
-    Besides, `arm` with `armed_by`, `jobs` with `pipeline`.
+    Also `arm` with `armed_by`, `jobs` with `pipeline`.
 steer!       DELETE  /captures/{capture}
-    `admin` for one that completed.
+    `admin` for a completed one.
 steer!       POST    /queue /queue/{entry}/start /queue:go-on
 steer!       PATCH   /queue/{entry}
 steer!       DELETE  /queue/{entry}
 steer!       POST    /lease
 steer!       PATCH   /lease
 admin|steer! DELETE  /lease
-    One's own by `steer`; with `force`, somebody else's, by `admin`.
+    One's own needs `steer`; with `force`, another's, `admin`.
 steer!       PUT     /uploads/{subject}/head.obj /uploads/{subject}/masks/{camera}.png
 steer!       DELETE  /uploads/{subject}
 arm!         POST    /devices/acknowledge
@@ -62,13 +61,13 @@ jobs!        DELETE  /jobs/{job}
 admin!       DELETE  /models/{model} /trash
 admin!       POST    /trash/{name}/restore
 """
-"""Scopes of which a token needs one, method, paths. "any": whatever its scopes; "open": no token is
-needed. "!": it logs in, steers, arms, submits, administrates or darkens: a refusal is audited."""
+"""Scopes of which a token needs one, method, paths. "any": a token with any scopes; "open": no
+token. "!": refusals are recorded in the audit log."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """A route as the table has it. A caller needs one of `scopes`; None: any token will do."""
+    """A route of the table. A caller needs one of `scopes`; None: any token."""
 
     method: str
     path: str
@@ -98,7 +97,7 @@ ROUTES = tuple(_routes())
 
 
 def route_of(method: str, path: str) -> Route | None:
-    """The route that a request is for; None where there is none."""
+    """The route of a request; None if there is none."""
     method = "GET" if method == "HEAD" else method
     for pattern, route in ROUTES:
         if route.method == method and pattern.match(path):

@@ -1,4 +1,4 @@
-"""Routes about who steers, what is dark, and who did what."""
+"""Routes of the lease, the devices and the audit log; identity of callers."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ async def caller(
         str | None, Header(alias="Hairstage-Lease", description="token of the lease")
     ] = None,
 ) -> Caller:
-    """Who asks; raises `Forbidden` where their token lacks a scope that the route needs."""
+    """The caller; raises `Forbidden` if their token lacks a scope of the route."""
     identity = request.state.identity
     service: Service | None = getattr(request.app.state, "service", None)  # 'view' has none
-    asked = None if service is None else service.moment()
-    by = Caller(address_of(request), lease, identity.name, identity.scopes, asked)
+    moment = None if service is None else service.moment()
+    by = Caller(address_of(request), lease, identity.name, identity.scopes, moment)
     for scope in SCOPES:
         if scope in needed.scopes:
             by.require(scope)
@@ -47,18 +47,18 @@ async def caller(
 
 
 RIGHT = "Hairstage-Blackout"
-"""The header with a page's right to a blackout."""
+"""The header with a page's blackout right."""
 
 
 def address_of(request: Request) -> str:
-    """Host and port from which a request comes, as the audit log has it."""
+    """Host and port of a request's client, for the audit log."""
     peer = request.client
     return f"{peer.host}:{peer.port}" if peer else "this machine"
 
 
 OnService = Annotated[Service, Depends(on_service)]
 Anybody = Annotated[Caller, Security(caller)]
-"""Any token will do."""
+"""A caller with any token."""
 Steers = Annotated[Caller, Security(caller, scopes=["steer"])]
 Arms = Annotated[Caller, Security(caller, scopes=["arm"])]
 Processes = Annotated[Caller, Security(caller, scopes=["jobs"])]
@@ -71,19 +71,19 @@ reading = APIRouter(dependencies=READS)
 
 @router.post("/lease", status_code=status.HTTP_201_CREATED, tags=["steering"])
 def take_lease(body: LeaseRequest, service: OnService, by: Steers) -> LeaseGrant:
-    """Steer alone for some time. Others are answered 409, but may abort and black out."""
+    """Take the lease. Other callers get 409, but may abort and black out."""
     return service.leasing.take(body, by)
 
 
 @reading.get("/lease", tags=["steering"])
 def get_lease(service: OnService) -> LeaseView:
-    """Who steers, if anybody in particular."""
+    """Holder of the lease, if any."""
     return service.leasing.view()
 
 
 @router.patch("/lease", tags=["steering"])
 def renew_lease(body: RenewRequest, service: OnService, by: Steers) -> LeaseGrant:
-    """Let the lease of the token end so many seconds from now."""
+    """Extend the token's lease to so many seconds from now."""
     return service.leasing.renew(body, by)
 
 
@@ -91,9 +91,9 @@ def renew_lease(body: RenewRequest, service: OnService, by: Steers) -> LeaseGran
 def release_lease(
     service: OnService,
     by: Anybody,
-    force: Annotated[bool, Query(description="whoever holds it; needs the scope admin")] = False,
+    force: Annotated[bool, Query(description="another's lease too; needs the scope admin")] = False,
 ) -> LeaseView:
-    """End the lease of the token."""
+    """Release the token's lease."""
     return service.leasing.end(by) if force else service.leasing.release(by)
 
 
@@ -101,14 +101,14 @@ def release_lease(
 def get_audit(
     service: OnService, limit: Annotated[int, Query(ge=1, le=10_000)] = 100
 ) -> list[Action]:
-    """The newest actions on the stage, refused ones too; the oldest of them first."""
+    """The newest actions on the stage, with refused ones, the oldest of them first."""
     return service.audit(limit)
 
 
 @reading.get("/devices", tags=["devices"])
 async def get_devices(service: OnService, lanes: OnLanes) -> dict[str, Any]:
-    """Each device and whether it answered when it was last seen, `age_s` seconds ago; under
-    `safety`, whether the lamps are known to be off."""
+    """State of each device at its last query, `age_s` seconds ago; `safety` has the lamps'
+    state."""
     return await lanes.devices(service.devices)
 
 
@@ -127,5 +127,5 @@ async def blackout(
 
 @router.post("/devices/acknowledge", tags=["devices"])
 def acknowledge(body: AcknowledgeRequest, service: OnService, by: Arms) -> dict[str, Any]:
-    """Somebody has looked: the lamps are off. Only where the link cannot tell by itself."""
+    """Record that a person has seen the lamps dark, if the link cannot read them back."""
     return service.acknowledge(body, by)

@@ -1,4 +1,4 @@
-"""Routes of what lies under the root folder: downloads, uploads, removal."""
+"""Routes of the root folder: downloads, uploads, trash."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stage_service.trash import Removed
 
 router = APIRouter(tags=["storage"])
 reading = APIRouter(dependencies=READS, tags=["storage"])
-DryRun = Annotated[bool, Query(description="only say what would be removed")]
+DryRun = Annotated[bool, Query(description="only list what would be removed")]
 Subject = Annotated[str, Path(pattern=FILE_NAME, max_length=LONGEST_NAME)]
 TAR = {
     **RANGES,
@@ -32,13 +32,13 @@ PNG = {"requestBody": {"required": True, "content": {"image/png": {}}}}
 async def remove_capture(
     capture: str, service: OnService, lanes: OnLanes, by: Steers, dry_run: DryRun = False
 ) -> Removed:
-    """Put a capture into the trash; one that completed needs the scope admin."""
+    """Move a capture to the trash; a completed one needs the scope admin."""
     return await lanes.jobs(service.remove_capture, capture, by, dry_run=dry_run)
 
 
 @reading.get("/captures/{capture}/archive.tar", response_class=Response, responses=TAR)
 def get_capture_archive(capture: str, service: OnService) -> Response:
-    """All files of a capture that is done, as a tar file; goes on by ranges where it broke off."""
+    """All files of a finished capture as a tar file, with ranges to resume."""
     return tar_response(capture, files_of(f"the capture {capture}", service.done_capture(capture)))
 
 
@@ -52,25 +52,25 @@ def list_models(service: OnService) -> list[Folder]:
 async def remove_model(
     model: str, service: OnService, lanes: OnLanes, by: Administrates, dry_run: DryRun = False
 ) -> Removed:
-    """Put a model into the trash; needs the scope admin."""
+    """Move a model to the trash; needs the scope admin."""
     return await lanes.jobs(service.storage.remove_model, model, by, dry_run=dry_run)
 
 
 @reading.get("/models/{model}/archive.tar", response_class=Response, responses=TAR)
 def get_model_archive(model: str, service: OnService) -> Response:
-    """All whole files of a model as a tar file."""
+    """All complete files of a model as a tar file."""
     return tar_response(model, files_of(f"the model {model}", service.storage.model(model).path))
 
 
 @reading.get("/trash")
 def list_trash(service: OnService) -> list[Removed]:
-    """What was removed and can be had again, oldest first."""
+    """Entries of the trash, the oldest first."""
     return service.storage.trash()
 
 
 @router.post("/trash/{name}/restore")
 def restore(name: str, service: OnService, by: Administrates) -> Removed:
-    """Put it back where it was; needs the scope admin."""
+    """Restore an entry; needs the scope admin."""
     return service.storage.restore(name, by)
 
 
@@ -81,19 +81,19 @@ def empty_trash(
     older_than_days: Annotated[float, Query(ge=0, le=10_000)] = KEPT_DAYS,
     dry_run: DryRun = False,
 ) -> list[Removed]:
-    """Delete for good what was removed so many days ago; needs the scope admin."""
+    """Delete entries older than so many days for good; needs the scope admin."""
     return service.storage.empty(older_than_days, by, dry_run=dry_run)
 
 
 @reading.get("/uploads")
 def list_uploads(service: OnService) -> list[Folder]:
-    """What was uploaded, by subject."""
+    """Uploads by subject."""
     return service.storage.uploads()
 
 
 @router.put("/uploads/{subject}/head.obj", openapi_extra=OBJ)
 async def upload_head(subject: Subject, request: Request, service: OnService, by: Steers) -> Folder:
-    """Keep a subject's digitised head, a Wavefront OBJ, for captures that name it as `upload`."""
+    """Store a subject's head, a Wavefront OBJ, for captures that name it as `upload`."""
     data = await request.body()
     return await run_in_threadpool(service.storage.upload_head, subject, data, by)
 
@@ -102,12 +102,12 @@ async def upload_head(subject: Subject, request: Request, service: OnService, by
 async def upload_mask(
     subject: Subject, camera: str, request: Request, service: OnService, by: Steers
 ) -> Folder:
-    """Keep a subject's hair mask of a camera, as large as its frames."""
+    """Store a subject's hair mask of a camera, in the size of its frames."""
     data, rig = await request.body(), service.rig_file.rig
     return await run_in_threadpool(service.storage.upload_mask, subject, camera, data, rig, by)
 
 
 @router.delete("/uploads/{subject}")
 def remove_upload(subject: Subject, service: OnService, by: Steers) -> Folder:
-    """Delete what was uploaded of a subject; captures have copies of their own."""
+    """Delete a subject's uploads; captures keep their copies."""
     return service.storage.remove_upload(subject, by)

@@ -1,4 +1,4 @@
-"""Routes of the viewer: its page, and what the page asks about a model."""
+"""Routes of the viewer: its page, and a model's data for it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Colour = Annotated[list[Annotated[float, Field(ge=0, le=1e9)]], Field(min_length
 
 
 class Light(BaseModel):
-    """How much of each light: its number, and by what its red, green and blue are multiplied."""
+    """Weights of lights: by number, factors of red, green and blue."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -59,14 +59,14 @@ class View(BaseModel):
     t: Vector
 
     def checked(self) -> dict[str, Any]:
-        """Its fields. Raises `BadLight` where it has too many pixels."""
+        """Its fields. Raises `BadLight` if it has too many pixels."""
         if self.width * self.height > MOST_PIXELS:
-            raise BadLight(f"a view may have {MOST_PIXELS} pixels, not {self.width * self.height}")
+            raise BadLight(f"a view may have {MOST_PIXELS} pixels, got {self.width * self.height}")
         return self.model_dump()
 
 
 class LightInView(Light):
-    """Light, and from where it is looked at."""
+    """Weights of lights, and the view."""
 
     view: View
 
@@ -77,7 +77,7 @@ router = APIRouter(prefix=f"{VIEW}/models", dependencies=[Security(caller)], tag
 
 
 async def on_viewing(request: Request) -> Viewing:
-    """The models that are looked at."""
+    """The models of this application."""
     viewing: Viewing = request.app.state.viewing
     return viewing
 
@@ -87,7 +87,7 @@ OnViewing = Annotated[Viewing, Depends(on_viewing)]
 
 @dataclass(frozen=True)
 class _Model:
-    """The model that a route is about, for one caller."""
+    """A route's model, for one caller."""
 
     name: str
     viewing: Viewing
@@ -98,12 +98,12 @@ class _Model:
         return self.viewing.do(self.name, operation, yields=self.yields, **options)
 
     def bytes(self, operation: str, **options: Any) -> Response:
-        """The same as an answer."""
+        """The same as a response."""
         return Response(self.do(operation, **options), media_type="application/octet-stream")
 
 
 async def viewed_model(name: str, request: Request, viewing: OnViewing) -> _Model:
-    """The model that a route is about."""
+    """The model of a route."""
     return _Model(name, viewing, not owner_of(request.scope).steers)
 
 
@@ -112,7 +112,7 @@ OnModel = Annotated[_Model, Depends(viewed_model)]
 
 @page.get(VIEW)
 def get_page() -> Response:
-    """The viewer; which model is in its address."""
+    """The viewer; its address names the model."""
     return _file("index.html")
 
 
@@ -132,13 +132,13 @@ def _file(name: str) -> Response:
 
 @reading.get("")
 def list_viewed(viewing: OnViewing) -> list[str]:
-    """The models that can be looked at."""
+    """Models that can be viewed."""
     return viewing.names()
 
 
 @reading.get("/{name}")
 def get_about(model: OnModel) -> dict[str, Any]:
-    """What there is of a model: its sets of strands, head, cameras, lights, material."""
+    """Contents of a model: sets of strands, head, cameras, lights, material."""
     about: dict[str, Any] = model.do("about")
     return about
 
@@ -150,8 +150,8 @@ def get_strands(
     first: Annotated[int, Query(ge=0)] = 0,
     count: Annotated[int, Query(ge=1, le=100_000)] = 2_000,
 ) -> Response:
-    """Some strands, any beginning of which is spread over all: points (uint16, `low + step * p`),
-    then lengths and radii (float32, metres), little-endian."""
+    """Some strands, in an order whose prefixes are spread over the head: points (uint16,
+    `low + step * p`), then lengths and radii (float32, metres), little-endian."""
     return model.bytes("strands", which=which, first=first, count=count)
 
 
@@ -163,7 +163,7 @@ def get_head(model: OnModel) -> Response:
 
 @reading.get("/{name}/confidence", **BYTES)
 def get_confidence(model: OnModel) -> Response:
-    """How near a measured point each point of the strands is: 255 at it, 0 at 5 mm and beyond."""
+    """Distance of each strand point to the nearest measured point: 255 at 0, 0 from 5 mm on."""
     return model.bytes("confidence")
 
 
@@ -176,42 +176,34 @@ def get_lighting(model: OnModel) -> dict[str, Any]:
 
 @reading.get("/{name}/table", **BYTES)
 def get_table(model: OnModel) -> Response:
-    """The azimuthal part of the hair's four lobes, by the eye's inclination and the turn."""
+    """Azimuthal scattering of the hair's four lobes by inclination and azimuth, float32."""
     return model.bytes("table")
 
 
-@reading.get("/{name}/seen/{light}", **BYTES)
-def get_seen(model: OnModel, light: int) -> Response:
-    """Where a light reaches: 255 or 0 for each point of the strands, then of the head."""
-    return model.bytes("seen", light=light)
+@reading.get("/{name}/visibility/{light}", **BYTES)
+def get_visibility(model: OnModel, light: int) -> Response:
+    """Visibility of a light, 255 or 0 for each point of the strands, then of the head."""
+    return model.bytes("visibility", light=light)
 
 
 @reading.post("/{name}/few")
 def get_few(model: OnModel, body: Light) -> list[dict[str, Any]]:
-    """The few lights that stand for all of these in the shader."""
+    """The few lights that represent these in the shader."""
     few: list[dict[str, Any]] = model.do("few", weights=_named(body))
     return few
 
 
-@reading.post("/{name}/indirect", **BYTES)
-def post_indirect(model: OnModel, body: Light) -> Response:
-    """Light between fibres under these lights: of each cell of the box of the strands, x fastest, 9
-    coefficients (RGB, float32) of harmonics over the direction in which it leaves. Paths are traced
-    when it is first asked for, which takes many seconds."""
-    return model.bytes("indirect", weights=_named(body))
-
-
 @reading.post("/{name}/indirect/view", **BYTES)
 def post_indirect_in_view(model: OnModel, body: LightInView) -> Response:
-    """Light between fibres under these lights as one view sees it: of hair, then of the head, for
-    each pixel its radiance (RGB) times the share that it covers, and that share, a fiftieth of both
-    in pixels of the other; float32. Paths are traced for seconds."""
+    """Indirect light under these lights in one view: for hair, then for the head, radiance (RGB)
+    times coverage, and coverage, a fiftieth of both in pixels of the other; float32. Takes
+    seconds."""
     return model.bytes("indirect_in_view", view=body.view.checked(), weights=_named(body))
 
 
 @reading.post("/{name}/sums/{camera}.png", **PNG)
 def get_sum(model: OnModel, camera: str, body: Light) -> Response:
-    """A camera's captured frames under these lights: their sum, exposed, in the sRGB curve."""
+    """The weighted sum of a camera's OLAT frames, exposed, sRGB."""
     png = model.do("sum", camera=camera, weights=_named(body), exposure=body.exposure)
     return Response(png, media_type="image/png")
 
@@ -220,7 +212,7 @@ def get_sum(model: OnModel, camera: str, body: Light) -> Response:
 def get_environment(
     model: OnModel, which: str, rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0
 ) -> dict[int, list[float]]:
-    """By what each light is multiplied to stand for the map "studio" or "sky"."""
+    """Weights of the lights that represent the map "studio" or "sky"."""
     return _lit(model.do("environment", which=which, rotation_deg=rotation_deg))
 
 
@@ -232,8 +224,8 @@ async def put_environment(
     request: Request,
     rotation_deg: Annotated[float, Query(ge=-360, le=360)] = 0.0,
 ) -> dict[int, list[float]]:
-    """By what each light is multiplied to stand for this .hdr or .exr map, of at most 4096 × 2048
-    pixels. It is not kept."""
+    """Weights of the lights that represent this .hdr or .exr map of at most 4096 × 2048 pixels. The
+    map is not stored."""
     data, kind = await request.body(), file.rpartition(".")[2].lower()
     if kind not in ("hdr", "exr"):
         raise BadLight(f"an environment map must be .hdr or .exr, got {kind!r}")
@@ -248,10 +240,10 @@ async def put_environment(
 
 
 def _lit(weights: list[list[float]]) -> dict[int, list[float]]:
-    """The `weights (L, 3)` of the lights that have any, by their numbers."""
+    """The non-zero `weights (L, 3)` by light number."""
     return {i: w for i, w in enumerate(weights) if any(w)}
 
 
 def _named(light: Light) -> dict[str, list[float]]:
-    """The weights by the lights' numbers, as JSON has them."""
+    """The weights by light number, as JSON keys."""
     return {str(number): list(weight) for number, weight in light.weights.items()}

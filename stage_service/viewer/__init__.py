@@ -1,6 +1,6 @@
-"""The viewer: strands that turn under the hand in a browser, and light that is dragged.
+"""The viewer: strands of a model in a browser, relit interactively.
 
-What the page is told lies here; `api/viewing.py` has the routes, `page/` what the browser runs.
+`api/viewing.py` has the routes, `page/` the browser's code.
 """
 
 from stage_service.viewer.errors import BadLight as BadLight

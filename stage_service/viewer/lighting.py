@@ -1,4 +1,4 @@
-"""Light on a model that is looked at: sums of captured frames, and what the shader needs."""
+"""Relighting of a viewed model: sums of OLAT frames, and data for the shader."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ from reconstruction import Camera, Capture, Light, Model
 from reconstruction.arrays import Array
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.errors import BadLight
-from stage_service.viewer.indirect import BakeOptions, IndirectLight, bake
 from stage_service.viewer.packing import PackedStrands
 from stage_service.viewer.resting import RestOptions, indirect_in_view
 
 MOST_LIGHTS = 8
-"""Lights that the shader adds up."""
+"""Lights in the shader."""
 LIGHTS_AT_REST = 32
-"""Lights that light between fibres is traced for, in one view."""
+"""Lights for which indirect light is traced in one view."""
 TURNS_OF_A_LIGHT = 8
-"""Lights of the rig that stand for one of these by turns, at rest."""
+"""Lights of the rig that each of these represents in turn, at rest."""
 COSINES, TURNS = 24, 96
-SEEN_CAMERAS, SEEN_LIGHTS, SEEN_PIXELS = 2, 8, 512
-"""Cameras, frames of each and pixels on a side that an exposure is made of without a fit."""
-KEPT_LIGHTS = 48
-"""Lights whose shadows are kept: a byte for each point of the strands and of the head."""
+EXPOSURE_CAMERAS, EXPOSURE_LIGHTS, EXPOSURE_PIXELS = 2, 8, 512
+"""Cameras, frames of each, and pixels per side from which an exposure is made without a fit."""
+CACHED_LIGHTS = 48
+"""Lights whose visibility is cached: a byte per point of the strands and of the head."""
 DOME_LIGHTS, DOME_RADIUS = 331, 1.5
 """The dome of a model without its capture."""
 
 
 class Lighting:
-    """What light does to one model, as `packed` is drawn. Safe to use from several threads."""
+    """Light on one model, drawn as `packed`. Safe to use from several threads."""
 
     def __init__(self, model: Model, capture: Capture | None, packed: PackedStrands) -> None:
         self._model, self._capture, self._packed = model, capture, packed
         self._lock = threading.RLock()
-        self._baking, self._resting = threading.Lock(), threading.Lock()
-        self._seen: OrderedDict[int, bytes] = OrderedDict()
+        self._resting = threading.Lock()
+        self._visibility: OrderedDict[int, bytes] = OrderedDict()
         self._sums: tuple[str, LightSums] | None = None
 
     @cached_property
     def lights(self) -> list[Light]:
-        """The rig's lights that were shot, as a fit found them, or a dome without a capture."""
+        """The captured lights, as estimated by a fit if there is one, or a dome without a
+        capture."""
         if self._capture is not None and (names := self._capture.olat_lights()):
             return fitted_lights(self._model, [self._capture.rig.light(n) for n in names])
         bright = np.full(3, 10.0)
@@ -67,19 +67,19 @@ class Lighting:
 
     @cached_property
     def fitted(self) -> FittedModel:
-        """The model with its material. Raises `ModelError` where none was fitted."""
+        """The model with its material. Raises `ModelError` without a fit."""
         return FittedModel.load(self._model, self._capture)
 
     @cached_property
     def exposure(self) -> Exposure:
-        """The capture's as the fit has it, else what some frames under one light want."""
+        """The fit's exposure, else that of some OLAT frames."""
         if self._model.has("appearance.json"):
             return self.fitted.appearance.exposure
         with self._lock:
             return Exposure(1.0) if self._capture is None else _exposure(self._capture)
 
     def about(self) -> dict[str, Any]:
-        """Lights, and the material if one was fitted; JSON-ready."""
+        """Lights, and the fitted material if there is one; JSON-ready."""
         out: dict[str, Any] = {
             "lights": [{"name": x.name, "position": x.position.tolist()} for x in self.lights],
             "exposure": self.exposure.scale,
@@ -98,14 +98,13 @@ class Lighting:
                 "logistic_scale": float(logistic_scale(hair.beta_n)),
                 "absorption": [float(x) for x in hair.sigma_a],
                 "skin": list(fitted.appearance.skin),
-                "cells": [x.tolist() for x in self._box],
                 "one_material": fitted.maps.uniform,
                 "field": fitted.field is not None,
             }
         return out
 
     def _missing(self) -> dict[str, int]:
-        """Lights that a camera has no frame of, by its name; none where it has all or no frames."""
+        """Number of missing OLAT frames by camera, for cameras that have some."""
         if self._capture is None:
             return {}
         has, names = self._capture.has_light, self._capture.olat_lights()
@@ -113,15 +112,16 @@ class Lighting:
         return {c: n for c, n in found.items() if 0 < n < len(names)}
 
     def table(self) -> bytes:
-        """`azimuthal_table` of the hair `(4, COSINES, TURNS, 4)`, float32; the last is not used."""
+        """`azimuthal_table` of the hair `(4, COSINES, TURNS, 4)`, float32; the last channel is
+        0."""
         cosines = (np.arange(COSINES) + 0.5) / COSINES
         turns = np.pi * (np.arange(TURNS) + 0.5) / TURNS
         (values,) = azimuthal_table(self.fitted.maps.mean(), cosines, turns)
         return np.pad(values, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
 
     def few(self, weights: dict[int, list[float]]) -> list[dict[str, Any]]:
-        """The few lights that the shader is to have for all of `weights` (number: RGB), and which
-        ones stand for each of them in `turns`, at rest."""
+        """The few lights that represent `weights` (number: RGB) in the shader, and in `turns` those
+        that each of them represents at rest."""
         full = self._full(weights)
         chosen = few_lights(self.lights, full, MOST_LIGHTS)
         turns = lights_in_turn(self.lights, full, MOST_LIGHTS, TURNS_OF_A_LIGHT)
@@ -142,35 +142,15 @@ class Lighting:
         full = np.zeros((len(self.lights), 3))
         for number, value in weights.items():
             if not 0 <= number < len(self.lights):
-                raise BadLight(f"there is no light number {number}: 0 to {len(self.lights) - 1}")
+                raise BadLight(f"light number {number}: expected 0 to {len(self.lights) - 1}")
             full[number] = value
         return full
 
-    @property
-    def _box(self) -> tuple[Array, Array]:
-        """Where the grid of indirect light begins and ends: the box of the strands."""
-        low, points = self._packed.low, self._packed.points.reshape(-1, 3)
-        extent = points.max(axis=0) if len(points) else np.ones(3)
-        return low, low + self._packed.step * np.maximum(extent, 1)
-
-    @cached_property
-    def _indirect(self) -> IndirectLight:
-        return bake(self._scene, self._box, self.lights, BakeOptions())
-
-    def indirect(self, weights: dict[int, list[float]]) -> bytes:
-        """What lights (number: RGB) make of light between fibres: coefficients `(n, n, n, 9, 3)`,
-        float32, z, y, x, of harmonics of degree 2 over the direction in which it leaves; colour.
-        The first call traces paths for many seconds."""
-        full = self._full(weights)
-        with self._baking:
-            baked = self._indirect
-        places = np.array([x.position for x in self.lights])
-        power = np.array([x.intensity_towards(np.zeros(3)) for x in self.lights])
-        lit = baked.lit(places, full * power / (places**2).sum(axis=1, keepdims=True))
-        return lit.astype("<f4").tobytes()
-
     def indirect_in_view(self, camera: Camera, weights: dict[int, list[float]]) -> bytes:
-        """The same as `camera` sees it: `indirect_in_view`, float32. Traces paths for seconds."""
+        """Indirect light in one view under lights (number: RGB); see `indirect_in_view`; float32.
+
+        Traces paths for seconds.
+        """
         chosen = few_lights(self.lights, self._full(weights), LIGHTS_AT_REST)
         with self._resting:
             found = indirect_in_view(
@@ -178,17 +158,15 @@ class Lighting:
             )
         return found.astype("<f4").tobytes()
 
-    def seen(self, number: int) -> bytes:
-        """Whether light `number` reaches each point `(S, n)`, then each vertex of the head: uint8.
-
-        255 where it does. A shadow ray through all strands from each.
-        """
+    def visibility(self, number: int) -> bytes:
+        """Visibility of light `number` from each point `(S, n)`, then each vertex of the head:
+        uint8, 255 where a shadow ray reaches it."""
         with self._lock:
-            found = self._seen.get(number)
+            found = self._visibility.get(number)
             if found is None:
-                found = self._seen[number] = self._traced(self.lights[number].position)
-                if len(self._seen) > KEPT_LIGHTS:
-                    self._seen.popitem(last=False)
+                found = self._visibility[number] = self._traced(self.lights[number].position)
+                if len(self._visibility) > CACHED_LIGHTS:
+                    self._visibility.popitem(last=False)
             return found
 
     def _traced(self, towards: Array) -> bytes:
@@ -208,25 +186,24 @@ class Lighting:
         return self.fitted.without_field().scene()
 
     def environment(self, which: str, rotation_deg: float) -> Array:
-        """What each light is multiplied by under the map "studio" or "sky", `(L, 3)`. Raises
+        """Weights `(L, 3)` of the lights that represent the map "studio" or "sky". Raises
         `BadLight`."""
         if which not in PROCEDURAL:
-            raise BadLight(f"there is no environment {which!r}: {', '.join(PROCEDURAL)}")
+            raise BadLight(f"unknown environment {which!r}: expected {' or '.join(PROCEDURAL)}")
         return weights_of_environment(self.lights, PROCEDURAL[which](), rotation_deg)
 
     def sum(self, camera: str, weights: dict[int, list[float]], exposure: float) -> bytes:
-        """A PNG of `camera`'s frames under lights (number: RGB): their sum, times `exposure`, in
-        the sRGB curve, each value rounded once. The nearest light stands for one whose frame is
-        missing."""
+        """A PNG of the sum of `camera`'s frames weighted by lights (number: RGB), times `exposure`,
+        sRGB. The nearest light replaces one whose frame is missing."""
         if self._capture is None:
-            raise BadLight("there are no frames: name the capture with --capture")
+            raise BadLight("the model has no captured frames: give --capture")
         with self._lock:
             if self._sums is None or self._sums[0] != camera:
-                self._sums = None  # the old one's memory first
+                self._sums = None  # free its memory first
                 self._sums = camera, LightSums(self._capture, camera)
             sums = self._sums[1]
         if not sums.names:
-            raise BadLight(f"{camera}: the capture has no frame of it under a single light")
+            raise BadLight(f"{camera}: the capture has no OLAT frame of this camera")
         there = np.isin([x.name for x in self.lights], sums.names)
         full = stand_ins(self.lights, self._full(weights), there)
         radiance = sums({self.lights[i].name: full[i] for i in np.flatnonzero(full.any(axis=1))})
@@ -237,12 +214,12 @@ class Lighting:
 
 
 def _exposure(capture: Capture) -> Exposure:
-    """What some of the frames under one light want: 1 where they are black."""
+    """The exposure of some OLAT frames; 1 if they are black."""
     lights, has, pixels = capture.olat_lights(), capture.has_light, [np.zeros((0, 3), np.float32)]
     shot = {c.name: [n for n in lights if has(n, c.name)] for c in capture.rig.cameras}
-    for camera in [c for c, names in shot.items() if names][:SEEN_CAMERAS]:
-        for name in shot[camera][:: -(-len(shot[camera]) // SEEN_LIGHTS)]:
+    for camera in [c for c, names in shot.items() if names][:EXPOSURE_CAMERAS]:
+        for name in shot[camera][:: -(-len(shot[camera]) // EXPOSURE_LIGHTS)]:
             frame = capture.light(name, camera)[0]
-            some = -(-max(frame.shape) // SEEN_PIXELS)
+            some = -(-max(frame.shape) // EXPOSURE_PIXELS)
             pixels.append(frame[::some, ::some].reshape(-1, 3))
     return Exposure.of_picture(np.concatenate(pixels))

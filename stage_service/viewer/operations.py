@@ -1,6 +1,6 @@
-"""What is done with one model for the viewer, by name: the routes' side of `Viewed`.
+"""Operations on a viewed model by name.
 
-Options and results are JSON-ready, or bytes, so that another process may do it.
+Options and results are JSON-ready or bytes, so that another process can run them.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from stage_service.viewer.errors import BadLight, NothingToView
 from stage_service.viewer.viewed import Viewed
 
 Weights = dict[str, list[float]]
-"""By a light's number, as JSON has it: what its red, green and blue are multiplied by."""
+"""Factors of red, green and blue by light number, as JSON keys."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A model's folder, and those of captures, the first of which that can be read is its own."""
+    """A model's folder, and candidates for its capture, of which the first readable one is used."""
 
     model: Path
     captures: tuple[Path, ...] = ()
 
     def open(self) -> Viewed:
-        """The model as it is viewed."""
+        """The model to view."""
         model = Model(self.model)
         for path in self.captures:
             with suppress(CaptureError):
@@ -41,15 +41,15 @@ def _strands(model: Viewed, which: str, first: int, count: int) -> bytes:
     return model.packed(which).chunk(first, count)
 
 
-def _seen(model: Viewed, light: int) -> bytes:
+def _visibility(model: Viewed, light: int) -> bytes:
     if not 0 <= light < len(model.lighting.lights):
-        raise NothingToView(f"there is no light number {light}")
-    return model.lighting.seen(light)
+        raise NothingToView(f"light number {light}: expected 0 to {len(model.lighting.lights) - 1}")
+    return model.lighting.visibility(light)
 
 
 def _sum(model: Viewed, camera: str, weights: Weights, exposure: float) -> bytes:
     if camera not in {c["name"] for c in model.about()["cameras"]}:
-        raise NothingToView(f"there is no camera {camera!r}")
+        raise NothingToView(f"unknown camera {camera!r}")
     return model.lighting.sum(camera, _numbered(weights), exposure)
 
 
@@ -68,7 +68,7 @@ def _environment(model: Viewed, which: str, rotation_deg: float) -> list[list[fl
 
 
 def _lights(model: Viewed) -> list[list[list[float]]]:
-    """Place and intensity towards the origin of each."""
+    """Position and intensity towards the origin of each light."""
     origin = np.zeros(3)
     return [
         [x.position.tolist(), x.intensity_towards(origin).tolist()] for x in model.lighting.lights
@@ -87,9 +87,8 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "lighting": lambda model: model.lighting.about(),
     "lights": _lights,
     "table": lambda model: model.lighting.table(),
-    "seen": _seen,
+    "visibility": _visibility,
     "few": lambda model, weights: model.lighting.few(_numbered(weights)),
-    "indirect": lambda model, weights: model.lighting.indirect(_numbered(weights)),
     "indirect_in_view": _in_view,
     "sum": _sum,
     "environment": _environment,

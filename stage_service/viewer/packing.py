@@ -1,4 +1,4 @@
-"""Strands as a browser draws them: as many points each, 16 bits a coordinate, coarse to fine."""
+"""Strands packed for a browser: equal point counts, 16 bits per coordinate, coarse to fine."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from reconstruction import Strands
 from reconstruction.arrays import Array, Floats, Ints
 
 POINTS = (16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""Points a strand may have; all strands of a set have as many."""
+"""Possible numbers of points per strand, equal for all strands of a set."""
 TOLERANCE = 1e-4
-"""Metres that half of the points may lie off at most; more points are taken to keep to it."""
+"""Metres of deviation that the median point may have; decides the number of points."""
 MOST_POINTS = 8_000_000
 _GOLDEN = 0.6180339887498949
 _LEVELS = 65_535
@@ -25,9 +25,9 @@ class PackedStrands:
 
     points (S, n, 3)    uint16; the place in metres is `low (3,) + step * points`
     lengths, radii (S,) float32, metres
-    order (S,)          which strand of the model each is; any beginning of it is spread over all
-    deviation           metres that 50, 95 and 100 % of the model's points lie off these polylines
-                        at most, rounding to 16 bits included
+    order (S,)          index of each in the model; prefixes are spread over all strands
+    deviation           metres, the 50th, 95th and 100th percentile of the model's points from these
+                        polylines, with the rounding to 16 bits
     """
 
     points: NDArray[np.uint16]
@@ -40,7 +40,7 @@ class PackedStrands:
 
     @classmethod
     def of(cls, strands: Strands) -> PackedStrands:
-        """As few points a strand as keep to `TOLERANCE`; what is missed is in `deviation`."""
+        """With the fewest points per strand that keep `TOLERANCE`, if `MOST_POINTS` allows."""
         order = np.argsort(np.arange(len(strands)) * _GOLDEN % 1, kind="stable")
         if not len(strands):
             none = np.zeros(0, np.float32)
@@ -71,7 +71,7 @@ class PackedStrands:
         )
 
     def positions(self) -> Floats:
-        """The points as they are drawn `(S, n, 3)`, metres."""
+        """The packed points `(S, n, 3)`, metres."""
         return (self.low + self.step * self.points).astype(np.float32)
 
     def chunk(self, first: int, count: int) -> bytes:
@@ -84,7 +84,7 @@ class PackedStrands:
 
 
 class _Polylines:
-    """Strands on one growing coordinate: the arc length over all of them, interpolated once."""
+    """Strands parametrised by their cumulative arc length, interpolated together."""
 
     def __init__(self, strands: Strands) -> None:
         self._points, self._offsets = strands.points.astype(float), strands.offsets
@@ -95,7 +95,7 @@ class _Polylines:
         self._arc = np.cumsum(along)
         self._begin = self._arc[self._offsets[:-1]]
         self._length = self._arc[self._offsets[1:] - 1] - self._begin
-        self._key = self._arc + self._strand  # a gap of 1 between strands: none runs into the next
+        self._key = self._arc + self._strand  # a gap of 1 separates strands
 
     def points(self, count: int) -> Array:
         """`count` points of each strand at equal arc lengths `(S, count, 3)`."""
@@ -105,7 +105,7 @@ class _Polylines:
         return np.stack([np.interp(at, self._key, x) for x in self._points.T], axis=-1)
 
     def missed(self, points: Array) -> Array:
-        """How far each point lies off the strands' new `points (S, n, 3)`, at its arc length."""
+        """Distance of each point from resampled `points (S, n, 3)` at the same arc length."""
         last = points.shape[1] - 1
         within = self._arc - self._begin[self._strand]
         length = self._length[self._strand]

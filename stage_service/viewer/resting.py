@@ -1,4 +1,4 @@
-"""Light between fibres in one view, path-traced when the page's picture rests in it."""
+"""Indirect light in one view, path-traced when the page's view is at rest."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from reconstruction.arrays import Array, Floats
 from reconstruction.options import Count, options
 
 _OTHER = 0.02
-"""What a pixel of the head weighs for hair, and one of hair for the head."""
+"""Weight of a head pixel for hair, and of a hair pixel for the head."""
 
 
 @options
 class RestOptions:
-    """`spp` paths a pixel of at most `max_depth` vertices; of many lights, each later vertex asks
-    `deep_lights`."""
+    """`spp` paths per pixel of at most `max_depth` vertices; later vertices sample `deep_lights`
+    lights."""
 
     spp: Count = 48
     max_depth: Count = 24
@@ -34,12 +34,12 @@ def indirect_in_view(
     lights: Sequence[tuple[Light, Array]],
     options: RestOptions,
 ) -> Floats:
-    """What `camera` sees of light that met the subject before, under `lights` at their weight (3,).
+    """Indirect radiance in the view of `camera` under `lights` with weights (3,).
 
-    Returns `(2, H, W, 4)`, for hair and for head: radiance averaged over `SIGMA` pixels times
-    a weight, and that weight: the share of the pixel that hair or head covers. What pixels of the
-    other have weighs little, and counts where there is nothing else: a strand before the face is
-    lit as the face is.
+    Returns `(2, H, W, 4)`, for hair and for head: radiance averaged over `SIGMA` pixels times a
+    weight, and the weight: the coverage of the pixel by hair or head. Pixels of the other have a
+    small weight, which counts where there are no others: a strand in front of the face gets the
+    face's light.
     """
     share = coverage(scene, camera)
     is_hair = share["hair"] >= share["head"]

@@ -1,4 +1,4 @@
-"""A model as the viewer shows it: strands, head, truth, the capture's cameras and frames."""
+"""A viewed model: strands, head, true strands, the capture's cameras and frames."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from stage_service.viewer.lighting import Lighting
 
 FAR = 5e-3
-"""Metres to the nearest measured point beyond which a strand's point counts as not measured."""
+"""Metres from the nearest measured point beyond which a point is not measured."""
 
 
 MOST_PIXELS = 100_000
-"""That a view may have which light is traced for."""
+"""Pixels of a view for which light is traced."""
 
 
 class Viewed:
-    """What the viewer asks of one model, and of its `capture` and the true strands if given.
+    """A model for the viewer, with its `capture` and true strands if given.
 
-    Everything is made when it is first asked for, and kept. Safe to use from several threads.
+    Data is computed on first use and cached. Safe to use from several threads.
     """
 
     def __init__(
@@ -56,9 +56,7 @@ class Viewed:
                 return self._packed
             if which == "truth" and self.truth is not None:
                 return self._packed_truth
-        raise NothingToView(
-            f"there are no strands {which!r}: expected 'model', or 'truth' if given"
-        )
+        raise NothingToView(f"unknown strands {which!r}: expected 'model', or 'truth' if given")
 
     @cached_property
     def _packed(self) -> PackedStrands:
@@ -71,7 +69,7 @@ class Viewed:
 
     @property
     def lighting(self) -> Lighting:
-        """What light does to it. Brings the renderer, which a service needs for nothing else."""
+        """Its relighting. Imports the renderer, which the service does not need otherwise."""
         with self.lock:
             return self._lighting
 
@@ -82,7 +80,7 @@ class Viewed:
         return Lighting(self.model, self.capture, self._packed)
 
     def about(self) -> dict[str, Any]:
-        """What there is, JSON-ready: sets of strands, head, cameras, lights."""
+        """Contents, JSON-ready: sets of strands, head, confidence, cameras."""
         sets = ["model"] if self.truth is None else ["model", "truth"]
         rig = None if self.capture is None else self.capture.rig
         return {
@@ -110,24 +108,23 @@ class Viewed:
         """The head: numbers of vertices and faces (uint32), vertices (float32), faces (uint32)."""
         head = self.head
         if head is None:
-            raise NothingToView("there is no head: neither the model nor its capture has one")
+            raise NothingToView("no head: neither the model nor its capture has one")
         sizes = np.array([len(head.vertices), len(head.faces)], "<u4")
         parts = (sizes, head.vertices.astype("<f4"), head.faces.astype("<u4"))
         return b"".join(np.ascontiguousarray(p).tobytes() for p in parts)
 
     def confidence(self) -> bytes:
-        """How near each point `(S, n)` of the model is to a measured one, uint8: 255 at it, 0 at
-        `FAR` and beyond."""
+        """Distance of each point `(S, n)` to a measured one, uint8: 255 at 0, 0 from `FAR` on."""
         with self.lock:
             return self._confidence
 
     @cached_property
     def _confidence(self) -> bytes:
         if not self.model.has("points.npz"):
-            raise NothingToView("the model has no points: it was not made from a sweep")
+            raise NothingToView("the model has no measured points: it was not made from a sweep")
         measured: Floats = self.model.points().points.astype(np.float32)
         places = self._packed.positions()
-        every = max(1, places.shape[1] // 16)  # what lies between is interpolated
+        every = max(1, places.shape[1] // 16)  # points between are interpolated
         at = np.unique(np.append(np.arange(0, places.shape[1], every), places.shape[1] - 1))
         tree = cKDTree(measured)
         distance, _ = tree.query(places[:, at], distance_upper_bound=FAR)

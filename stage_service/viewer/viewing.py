@@ -1,4 +1,4 @@
-"""Which models are viewed, in this process; the few that were last are kept in memory."""
+"""Viewed models by name, and a cache of the latest."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from stage_service.viewer.operations import OPERATIONS, Source
 from stage_service.viewer.tracer import Tracer
 from stage_service.viewer.viewed import Viewed
 
-KEPT = 2
+CACHED = 2
 
 
-class Kept:
-    """Models by whatever `open_model` reads them by (or raises `LookupError`)."""
+class Cache:
+    """The latest models; `open_model` reads one by its key (or raises `LookupError`)."""
 
     def __init__(self, open_model: Callable[[Any], Viewed]) -> None:
         self._open = open_model
-        self._kept: OrderedDict[Hashable, tuple[object, Viewed]] = OrderedDict()
+        self._cached: OrderedDict[Hashable, tuple[object, Viewed]] = OrderedDict()
         self._lock = threading.Lock()
 
     def get(self, name: Hashable) -> Viewed:
-        """The model of that name, read anew where its strands have changed."""
+        """The model of that name, read again if its files have changed."""
         with self._lock:
-            found = self._kept.get(name)
+            found = self._cached.get(name)
             if found is None or found[0] != _version(found[1]):
                 viewed = self._open(name)
                 found = _version(viewed), viewed
-                self._kept[name] = found
-            self._kept.move_to_end(name)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
+                self._cached[name] = found
+            self._cached.move_to_end(name)
+            while len(self._cached) > CACHED:
+                self._cached.popitem(last=False)
             return found[1]
 
 
 class Viewing:
     """Models by name: `names` lists them, `open_model` reads one (or raises `LookupError`);
-    `decoder` is for maps that they are lit by."""
+    `decoder` decodes environment maps."""
 
     def __init__(
         self,
@@ -48,20 +48,20 @@ class Viewing:
         decoder: Decoder,
     ) -> None:
         self.names, self.decoder = names, decoder
-        self._kept = Kept(open_model)
+        self._models = Cache(open_model)
 
     def get(self, name: str) -> Viewed:
-        """The model of that name, read anew where its strands have changed."""
-        return self._kept.get(name)
+        """The model of that name, read again if its files have changed."""
+        return self._models.get(name)
 
     def do(self, name: str, operation: str, *, yields: bool = False, **options: Any) -> Any:
-        """What one of `OPERATIONS` makes of a model: bytes, or JSON-ready. With `yields` it may be
-        stopped for a capture. Raises `LookupError`, `BadLight`, `ModelError`, `CaptureError`."""
+        """The result of one of `OPERATIONS`, bytes or JSON-ready. With `yields` it may be stopped
+        for a capture. Raises `LookupError`, `BadLight`, `ModelError`, `CaptureError`."""
         return OPERATIONS[operation](self.get(name), **options)
 
 
 class RemoteViewing(Viewing):
-    """The same, in the process of a `tracer`; `find` says where a model lies."""
+    """The same in the process of a `tracer`; `find` locates a model."""
 
     def __init__(
         self,
@@ -79,6 +79,6 @@ class RemoteViewing(Viewing):
 
 
 def _version(viewed: Viewed) -> object:
-    """What changes when the model is made or fitted again."""
+    """Modification times, which change when the model is made or fitted again."""
     files = (viewed.model.file(n) for n in ("strands.npz", "appearance.json", "hair_maps.npz"))
     return [f.stat().st_mtime_ns if f.exists() else None for f in files]

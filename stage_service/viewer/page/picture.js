@@ -213,7 +213,6 @@ export class Picture {
         gl.enable(gl.DEPTH_TEST);
       };
       const camera = view(wide, height), common = this.common(camera, how);
-      if (this.lit()) this.lighting.facing(camera.eye);
       begin();
       if (this.head && state.head && state.opacity === 1) {
         const skin = how.light ? this.shadowedSkin : this.lit() ? this.litSkin : this.skin;

@@ -4,20 +4,17 @@
 import { choice, element, labelled, slider } from "./controls.js";
 import { texture } from "./gl.js";
 import * as net from "./net.js";
-import { dot, sub, unit } from "./space.js";
+import { dot, unit } from "./space.js";
 
 const NEAREST = 3;
-const TERMS = 9;
-const MOST_KEPT = 24;  // lights of which it is kept what they see; more than are shaded at once
-const TRACED_PIXELS = 50000;  // of a view in which light between fibres is traced
+const MOST_KEPT = 24;  // lights whose visibility is cached; more than are shaded at once
+const TRACED_PIXELS = 50000;  // of a view in which indirect light is traced
 
-// Real spherical harmonics of degree 2, in the order of appearance/render/harmonics.py.
-function harmonics(x, y, z, out) {
-  const r = 1 / Math.max(Math.sqrt(x * x + y * y + z * z), 1e-9);
-  x *= r; y *= r; z *= r;
-  out[0] = 0.2820948; out[1] = 0.4886025 * y; out[2] = 0.4886025 * z; out[3] = 0.4886025 * x;
-  out[4] = 1.0925484 * x * y; out[5] = 1.0925484 * y * z; out[6] = 0.3153916 * (3 * z * z - 1);
-  out[7] = 1.0925484 * x * z; out[8] = 0.5462742 * (x * x - y * y);
+// Mean radiance of pixels [radiance × weight, weight].
+function meanOf(pixels) {
+  const sum = [0, 0, 0, 1e-9];
+  for (let i = 0; i < pixels.length; i++) sum[i % 4] += pixels[i];
+  return sum.slice(0, 3).map((x) => x / sum[3]);
 }
 
 export class Relight {
@@ -44,56 +41,7 @@ export class Relight {
     });
     this.nothing = texture(gl, gl.TEXTURE_2D, gl.NEAREST,
       () => gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, 1, 1));
-    this.between(new Float32Array(TERMS * 3));
     picture.setLighting(this);
-  }
-
-  // Light between fibres: of each cell coefficients of harmonics over the direction that it leaves in.
-  between(coefficients) {
-    const { gl } = this.viewer, side = Math.round(Math.cbrt(coefficients.length / TERMS / 3));
-    if (this.cells) gl.deleteTexture(this.cells.texture);
-    this.cells = texture(gl, gl.TEXTURE_3D, gl.LINEAR,
-      () => gl.texStorage3D(gl.TEXTURE_3D, 1, gl.RGBA16F, side, side, side));
-    this.grid = { coefficients, side, towards: null };
-  }
-
-  // What of it leaves for `eye`, for the shader to look up.
-  facing(eye) {
-    const { side, towards } = this.grid, { gl } = this.viewer;
-    if (towards && towards.every((x, i) => x === eye[i])) return;
-    this.grid.towards = [...eye];
-    gl.bindTexture(gl.TEXTURE_3D, this.cells.texture);
-    gl.texSubImage3D(
-      gl.TEXTURE_3D, 0, 0, 0, 0, side, side, side, gl.RGBA, gl.FLOAT, this.leaving(eye));
-  }
-
-  leaving(eye) {  // in every frame that turns: nothing is allocated for a cell
-    const { coefficients, side } = this.grid, [low, high] = this.told.material.cells;
-    const out = new Float32Array(4 * side ** 3), terms = new Float64Array(TERMS);
-    const steps = low.map((x, i) => (high[i] - x) / Math.max(side - 1, 1));
-    for (let cell = 0; cell < side ** 3; cell++) {
-      const i = cell % side, j = Math.floor(cell / side) % side, k = Math.floor(cell / side ** 2);
-      harmonics(eye[0] - low[0] - steps[0] * i, eye[1] - low[1] - steps[1] * j,
-        eye[2] - low[2] - steps[2] * k, terms);
-      for (let c = 0; c < 3; c++) {
-        let sum = 0;
-        for (let t = 0; t < TERMS; t++) sum += terms[t] * coefficients[3 * (TERMS * cell + t) + c];
-        out[4 * cell + c] = Math.max(sum, 0);
-      }
-    }
-    return out;
-  }
-
-  // The server traces it once, which takes a while; the rest does not wait.
-  async indirect(body) {
-    const { viewer } = this, asked = this.asked = {};
-    if (!this.baked) viewer.status("tracing light between the fibres: once, and it takes a while");
-    const values = new Float32Array(await net.bytes("/indirect", body));
-    this.baked = true;
-    if (asked !== this.asked) return;
-    this.between(values);
-    viewer.status("");
-    viewer.draw();
   }
 
   // How often each light has its turn until all that it stands for had theirs.
@@ -102,8 +50,8 @@ export class Relight {
   // What stands for light number `only` in a turn of it.
   inTurn(only, turn) { const { turns } = this.lights[only]; return turns[turn % turns.length]; }
 
-  // Light between fibres in the view of `camera`, finer than the grid's: the server traces it when
-  // the picture rests, once for a view and a light. Resolves when its answer is there.
+  // Indirect light in the view of `camera`: the server traces it when the view is at rest, once for
+  // a view and a light. Resolves with the response.
   inView(camera) {
     const asked = JSON.stringify([this.weights, camera]);
     if (asked === this.rest?.asked) return this.rest.done;
@@ -125,6 +73,7 @@ export class Relight {
         values.subarray(first, first + half));
     }));
     rest.textures = { uOfHair, uOfHead };
+    this.mean = [0, half].map((first) => meanOf(values.subarray(first, first + half)));
     picture.again();
   }
 
@@ -144,13 +93,14 @@ export class Relight {
       uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
       uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
-      uIndirect: this.cells, uAmbient: this.ambient,
+      uHairIndirect: this.lights.length ? this.mean[0] : [0, 0, 0],
+      uHeadIndirect: this.lights.length ? this.mean[1] : [0, 0, 0], uAmbient: this.ambient,
       ...(this.rest?.textures ?? { uOfHair: this.nothing, uOfHead: this.nothing }),
-      uCells: material.cells[0], uSpan: sub(material.cells[1], material.cells[0]),
     };
   }
 
   ambient = 1;
+  mean = [[0, 0, 0], [0, 0, 0]];  // of the view that was traced last: hair, head; for motion
 
   // --- the light
   towards(way, colour = [1, 1, 1]) {
@@ -229,14 +179,13 @@ export class Relight {
     this.lights = lights;
     viewer.draw();
     viewer.status("");
-    this.traced = this.indirect(body).catch((error) => viewer.status(error.message));
   }
 
   // Have what these lights see in `kept`, of the others those that were shaded last.
   async keep(numbers) {
     if (numbers.some((n) => !this.kept.has(n))) this.viewer.status("casting shadows");
     for (const number of numbers) {
-      const data = this.kept.get(number) ?? new Uint8Array(await net.bytes(`/seen/${number}`));
+      const data = this.kept.get(number) ?? new Uint8Array(await net.bytes(`/visibility/${number}`));
       this.kept.delete(number);  // a Map has its keys in the order in which they came
       this.kept.set(number, data);
     }
@@ -287,8 +236,8 @@ export class Relight {
         viewer.draw();
       })));
       const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
-        "later) with shadows; light between fibres, times “indirect”, is path-traced for a picture that " +
-        "rests, a moment after it; before, it is known to a centimetre or so."];
+        "later) with shadows. Indirect light, times “indirect”, is path-traced when the view is at rest; " +
+        "in motion its mean over the view is added."];
       if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
       if (told.material.field) notes.push("The model's field is not shown.");
       notes.push("Of an environment up to 64 lights are shaded at rest, eight in motion.");

@@ -2,7 +2,7 @@
 
 const HEAD = `#version 300 es
 precision highp float; precision highp int;
-precision highp sampler2D; precision highp sampler3D; precision highp usampler2D;
+precision highp sampler2D; precision highp usampler2D;
 `;
 
 const STRAND = HEAD + `
@@ -231,13 +231,8 @@ Tilted tilted(float si, float ci, float tilt) {  // the inclination that R, TT, 
 const LIGHTS = `
 uniform int uLights;
 uniform vec3 uLightAt[8], uLightPower[8];
-uniform sampler3D uIndirect;  // of all lights together, in cells from uCells to uCells + uSpan
-uniform vec3 uCells, uSpan;
+uniform vec3 uHairIndirect, uHeadIndirect;  // means over the last traced view
 uniform float uAmbient;
-vec3 indirect(vec3 p) {
-  vec3 n = vec3(textureSize(uIndirect, 0));
-  return uAmbient * texture(uIndirect, ((p - uCells) / uSpan * (n - 1.0) + 0.5) / n).rgb;
-}
 vec3 incoming(int i, vec3 p, out vec3 l) {
   l = uLightAt[i] - p;
   float d2 = dot(l, l);
@@ -260,7 +255,7 @@ vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
   float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
   Tilted leans = tilted(si, ci, uTilt);
   vec4 seen0 = texelFetch(uSeen0, at, 0), seen1 = texelFetch(uSeen1, at, 0);
-  vec3 across = (view - si * t) / ci, sum = indirect(p);
+  vec3 across = (view - si * t) / ci, sum = uAmbient * uHairIndirect;
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
@@ -296,13 +291,13 @@ bool hidden(vec3 p, uint mine, float slack) {
 }
 `;
 
-// Light between fibres, traced for the view of this picture: radiance times the share of the pixel
-// that is hair (or head), and that share, little of the other; what it does not know is looked up in the grid.
+// Indirect light, traced for this view: radiance times coverage by hair (or head), and coverage; its
+// mean where nothing was traced.
 const IN_VIEW = `
 uniform vec2 uPart;  // pixels that the view is drawn on
-vec3 between(sampler2D traced, vec3 p) {
+vec3 between(sampler2D traced, vec3 mean) {
   vec4 found = texture(traced, vec2(gl_FragCoord.x, uPart.y - gl_FragCoord.y) / uPart);
-  return found.a > 1e-3 && gl_FragCoord.x < uPart.x ? uAmbient * found.rgb / found.a : indirect(p);
+  return found.a > 1e-3 && gl_FragCoord.x < uPart.x ? uAmbient * found.rgb / found.a : uAmbient * mean;
 }
 `;
 
@@ -345,7 +340,7 @@ vec3 fibre(vec3 t, vec3 view, vec3 l) {
 void main() {
   vec3 p = surface(), l;
   if (dot(uSlice.xyz, p) > uSlice.w) discard;
-  vec3 power = incoming(0, p, l), c = between(uOfHair, p);
+  vec3 power = incoming(0, p, l), c = between(uOfHair, uHairIndirect);
   if (!hidden(p, vStrand, 2e-5)) c += power * fibre(normalize(vTangent), normalize(uEye - p), l);
   oColour = vec4(c * uOpacity, uOpacity);
 }`;
@@ -353,7 +348,7 @@ void main() {
 export const LIT_HEAD = LIGHTS + `
 uniform vec3 uSkin;
 vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
-  vec3 sum = indirect(p);
+  vec3 sum = uAmbient * uHeadIndirect;
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
@@ -372,5 +367,5 @@ vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
   vec3 l, power = incoming(0, p, l);
   float cosine = max(dot(n, l), 0.0);
   bool dark = cosine == 0.0 || hidden(p + 2.0 * uTexel * n, 0xfffffffeu, 2.0 * uTexel);
-  return power * (dark ? 0.0 : cosine / 3.14159265) * uSkin + between(uOfHead, p);
+  return power * (dark ? 0.0 : cosine / 3.14159265) * uSkin + between(uOfHead, uHeadIndirect);
 }`;

@@ -108,7 +108,6 @@ LIGHT = """async (what) => {
         const net = await import("/view/page/net.js");
         await relight.environment(() => net.json(net.ofModel(`/environments/${what}`)));
     }
-    await relight.traced;
 }"""
 
 AT_REST = """async ([size, least, ambient]) => {

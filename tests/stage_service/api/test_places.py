@@ -20,8 +20,8 @@ from waiting import until
 from reconstruction import Model, Strands
 from stage_service.api import bodies, connections, pace, porch
 from stage_service.api.gate import Access
-from stage_service.api.pace import Pace, Paced
 from stage_service.api.places import LIMITS, Kind, NoPlace, Owner, Places
+from stage_service.api.throttle import Throttle, Throttled
 from stage_service.records.tokens import Scope, Tokens
 
 SCOPES: dict[str, tuple[Scope, ...]] = {
@@ -186,16 +186,16 @@ def test_while_a_capture_is_shot_work_of_others_is_done_one_piece_after_the_othe
 
     async def run() -> None:
         running = [True]
-        found = Pace(lambda: running[0])
+        found = Throttle(lambda: running[0])
         first = await found.turn()
-        with pytest.raises(Paced, match="a capture is being shot"):
+        with pytest.raises(Throttled, match="a capture is running"):
             await found.turn()
         first.end()
         first.end()  # once
         monkeypatch.setattr(pace, "SHARE", 1e-6)
         # What it took is rested for, a million times as long.
         (await found.turn(patient=True)).end()
-        with pytest.raises(Paced):
+        with pytest.raises(Throttled):
             await found.turn()
         running[0] = False
         (await found.turn()).end()
@@ -303,7 +303,7 @@ def test_while_a_capture_is_shot_others_wait_and_who_steers_does_not(callers, wo
             ("reader", "POST /captures/another/abort"),
             ("", "GET /rig"),
         ):
-            assert_refused(callers.ask(name, what), 503, "a capture is being shot")
+            assert_refused(callers.ask(name, what), 503, "a capture is running")
         for what in ("GET /rig", "GET /captures", f"GET /captures/{capture}/steps"):
             assert callers.ask("ada", what).status_code == 200
         assert callers.ask("reader", f"POST /captures/{capture}/abort").status_code == 200
@@ -317,8 +317,8 @@ def test_while_a_capture_is_shot_models_are_shown_to_who_steers_alone(callers, w
     Model(folder).create().write_strands(Strands.from_list([[[0, 0, 0], [0, 0, 1]]], radius=1e-4))
     assert callers.ask("reader", "GET /view/models/m").json()["name"] == "m"
     with shooting(callers, world):
-        for what in ("GET /view/models/m", "POST /view/models/m/indirect"):
-            assert_refused(callers.ask("reader", what), 503, "a capture is being shot")
+        for what in ("GET /view/models/m", "POST /view/models/m/indirect/view"):
+            assert_refused(callers.ask("reader", what), 503, "a capture is running")
         assert callers.ask("ada", "GET /view/models/m").json()["name"] == "m"
 
 

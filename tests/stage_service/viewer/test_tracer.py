@@ -61,7 +61,7 @@ def test_it_says_what_this_process_would(model, tracing):
         here = OPERATIONS[operation](viewed, **options)
         assert tracing.do(source, operation, options, yields=True) == here, operation
     with pytest.raises(NothingToView, match="no light number 999"):
-        tracing.do(source, "seen", {"light": 999}, yields=True)
+        tracing.do(source, "visibility", {"light": 999}, yields=True)
     with pytest.raises(RuntimeError, match="KeyError"):
         tracing.do(source, "none of them", {}, yields=True)
     assert Path(f"/proc/{tracing.pid}/stat").read_text().rpartition(")")[2].split()[16] == "19"

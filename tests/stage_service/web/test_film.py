@@ -35,7 +35,8 @@ PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
 
 AT_REST = """() => {
   const { relight, picture } = viewer;
-  return relight.baked && !relight.under && picture.samples >= Math.max(8, picture.cycle());
+  const still = relight.rest?.textures && !relight.under;
+  return still && picture.samples >= Math.max(8, picture.cycle());
 }"""
 
 
