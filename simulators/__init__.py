@@ -1,1 +1,1 @@
-"""The device side of the wires: a rig without hardware, its frames rendered."""
+"""A simulated rig: the devices' side of the wires, with rendered frames."""

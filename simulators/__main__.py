@@ -1,4 +1,4 @@
-"""`python -m simulators`: a rig and a subject that exist only here, behind the real wires."""
+"""`python -m simulators`: a simulated rig and subject behind the real wire protocols."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 
 from appearance.scene.backend import BackendError, ensure_backend
 from reconstruction.geometry.rig import RigError
-from simulators.frames.frames import FrameMaker, Sensor, cache_key
+from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.render_process import RenderPool
 from simulators.frames.responses import Quality, Responder, reproducible
 from simulators.peers.devices import SimulatedStage
@@ -35,8 +34,8 @@ _FAILED, _BAD_INPUT = 1, 2
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulated rig until SIGTERM or SIGINT; returns the exit code.
 
-    When ready, one line of JSON goes to stdout and `STATE/devices.toml` is there. Exit code 2 is a
-    wrong argument or file, 1 anything else that keeps the devices from starting.
+    When ready, it prints one line of JSON and `STATE/devices.toml` exists. Exit code 2: invalid
+    argument or file; 1: the devices cannot start.
     """
     parser = _parser()
     args = parser.parse_args(arguments)
@@ -63,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _BAD_INPUT
     try:
         if isinstance(subject, Subject):
-            ensure_backend()  # here, not at the first frame of a capture
+            ensure_backend()  # fail before the first frame of a capture
         _run(args, rig_file, subject, drift, faults)
     except (OSError, BackendError) as error:
         print(f"simulators: {error}", file=sys.stderr)
@@ -88,15 +87,14 @@ def _run(
             make = functools.partial(PropResponder, rig, subject)
         names = [c.name for c in rig.cameras]
         responder = RenderPool(make, names, args.processes)
-        key = cache_key(subject.digest(), rig.to_dict(), asdict(quality), args.seed)
-        frames = FrameMaker(rig, responder, sensor, args.seed, args.cache, key)
+        frames = FrameMaker(rig, responder, sensor, args.seed)
         log = args.truth / EXPOSURES if args.truth is not None else None
         counts = frames.counts if args.drift_mm > 0 else frames.counts_at_rest
         world = World(rig, Lamps(len(rig.lights)), faults, counts, log, args.processes)
         free = args.ports == "auto"
         wires, paced = rig_file.devices, args.paced
         stage = SimulatedStage(world, sensor, args.state, wires, free, paced)
-        # Ends in reverse: the renderer first, so that no frame holds up the devices' end.
+        # the stack ends in reverse: the renderer first, so that no frame delays the devices' end
         stack.enter_context(stage)
         stack.callback(responder.stop)
         ready = {"ready": True, "devices": str(args.state / "devices.toml"), **stage.devices}
@@ -105,7 +103,7 @@ def _run(
 
 
 def _poses(rig_file: RigFile) -> int:
-    """Tracking frames of a whole sweep: one for every full group of rows."""
+    """Tracking frames of a sweep: one per full group of rows."""
     every = max(rig_file.capture.tracking_every, 1)
     return max(1, sum(max(1, p.height // every) for p in rig_file.rig.projectors))
 
@@ -115,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m simulators",
         description="Simulated light stage: LED bank on the rig file's wire, trigger box and "
         "projector controller on pseudo-terminals, cameras on TCP. Frames are rendered from "
-        "what the devices were commanded to do. Runs until SIGTERM.",
+        "the devices' commanded states. Runs until SIGTERM.",
     )
     parser.add_argument("--rig", type=Path, required=True, help="rig file (TOML or JSON)")
     parser.add_argument(
@@ -132,11 +130,12 @@ def _parser() -> argparse.ArgumentParser:
         "--ports", choices=("auto", "rig"), default="rig", help="free TCP ports, or the rig file's"
     )
     parser.add_argument(
-        "--paced", action="store_true", help="a light bank on RTU answers at its baud rate"
+        "--paced",
+        action="store_true",
+        help="delay responses of a light bank on RTU to its baud rate",
     )
-    parser.add_argument("--truth", type=Path, help="write the true strands, head, poses here")
-    parser.add_argument("--truth-only", type=Path, help="write the truth here and end")
-    parser.add_argument("--cache", type=Path, help="keep the lights' responses here between runs")
+    parser.add_argument("--truth", type=Path, help="folder for the true strands, head and poses")
+    parser.add_argument("--truth-only", type=Path, help="write the truth to this folder and exit")
     parser.add_argument(
         "--spp", type=int, default=Quality.lights, help="paths per pixel (default: %(default)s)"
     )
@@ -144,10 +143,10 @@ def _parser() -> argparse.ArgumentParser:
         "--processes",
         type=int,
         default=min(os.cpu_count() or 1, 4),
-        help="rendering processes; frames do not depend on it (default: %(default)s)",
+        help="rendering processes; frames do not depend on their number (default: %(default)s)",
     )
     parser.add_argument(
-        "--drift-mm", type=float, default=1.5, help="how far the subject drifts (default: 1.5)"
+        "--drift-mm", type=float, default=1.5, help="drift of the subject (default: 1.5)"
     )
     return parser
 

@@ -1,4 +1,4 @@
-"""What ties the devices together: a pulse turns their commanded state into the cameras' frames."""
+"""The simulated stage: a trigger pulse turns the devices' commanded state into frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BLOCK_IDS = 65535
 
 @dataclass(frozen=True, eq=False)
 class Exposed:
-    """A frame that a camera holds: `counts` may still be in the making."""
+    """A frame in a camera's queue; `counts` may still be rendered."""
 
     block_id: int
     timestamp: float
@@ -46,16 +46,14 @@ class _CameraState:
 
 
 class World:
-    """The commanded state of the stage, and the frames it leads to. Safe to call from any thread.
+    """The commanded state of the stage, and the resulting frames. Safe to call from any thread.
 
     The subject is at pose 0 until the sweep. A tracking exposure (all projectors on) after rows
-    were shown begins the next pose, which holds for the rows after it; a repeated tracking
-    exposure stays at its pose. The subject takes their place again, pose 0, when a new capture
-    begins: when the first pulse after a reset sees no light, or a lamp alone is lit.
+    begins the next pose; a repeated one keeps it. Pose 0 returns when a new capture begins: at the
+    first pulse after a reset if it is dark, or when a single lamp is lit.
 
-    `make` renders and exposes on one thread for each of `lanes`; camera number i belongs to lane
-    i modulo `lanes`, and a camera's frames are made one after the other. `log`, when given, gets
-    one JSON line a pulse with its pose.
+    `make` renders and exposes on one thread per lane; camera number i belongs to lane i modulo
+    `lanes`. `log` gets one JSON line per pulse with its pose.
     """
 
     def __init__(
@@ -95,9 +93,9 @@ class World:
             self._pulses = 0
 
     def pulse(self, fires: int = 1, counts: int = 1) -> int:
-        """Fire all armed cameras at the present state; returns the pulse count.
+        """Fire all armed cameras in the present state; returns the pulse count.
 
-        A faulty trigger fires twice or not at all, or does not count.
+        A faulty trigger fires twice, not at all, or does not count.
         """
         with self._lock:
             self._pulses += counts
@@ -116,43 +114,44 @@ class World:
             return self._pulses
 
     def strikes(self, device: str, request: str) -> Fault | None:
-        """The fault of the serial device's wire at this request; PULSE is about the pulse to be."""
+        """The fault of a serial device's wire at this request; PULSE has the number of its
+        pulse."""
         return self.faults.on_request(device, request, self._pulses + request.startswith("PULSE"))
 
     def hello(self, camera: str) -> None:
-        """Start counting the camera's frames again; it is not armed and holds none."""
+        """Reset the camera: not armed, no frames, frame number 0."""
         with self._lock:
             self._empty(camera)
             self._cameras[camera].exposure = None
             self._cameras[camera].block_id = 0
 
     def arm(self, camera: str, exposure: float | None) -> None:
-        """Arm for the next pulses with an empty queue; None disarms and leaves the queue."""
+        """Arm with an empty queue; None disarms and keeps the queue."""
         with self._lock:
             if exposure is not None:
                 self._empty(camera)
             self._cameras[camera].exposure = exposure
 
     def oldest(self, camera: str) -> Exposed | None:
-        """The oldest frame that the camera holds, ready or not; it stays until `take`."""
+        """The oldest frame in the queue, rendered or not; it stays until `take`."""
         with self._lock:
             queue = self._cameras[camera].queue
             return queue[0] if queue else None
 
     def take(self, camera: str, frame: Exposed) -> None:
-        """Remove `frame`, which was the oldest, if it is still there."""
+        """Remove `frame` if it is still the oldest."""
         with self._lock:
             queue = self._cameras[camera].queue
             if queue and queue[0] is frame:
                 queue.popleft()
 
     def held(self, camera: str) -> int:
-        """How many frames the camera holds, ready or not."""
+        """Number of frames in the camera's queue."""
         with self._lock:
             return len(self._cameras[camera].queue)
 
     def begun(self, device: str, kind: str, camera: str | None = None) -> bool:
-        """Whether a lasting fault of the device shows."""
+        """Whether a lasting fault of the device is active."""
         return self.faults.since(device, kind, self._fired, camera)
 
     def stop(self) -> None:

@@ -1,18 +1,12 @@
-"""Frames from commanded states: light vector times what the (camera, pose) pair answers, as a
-sensor counts it."""
+"""Frames from commanded states: weighted sums of the responses of a camera and pose, as sensor
+counts."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
-import importlib.util
-import json
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,21 +14,17 @@ from numpy.typing import NDArray
 
 from reconstruction import Rig
 from reconstruction.arrays import AnyFloats, Array, Floats
-from reconstruction.files.durable import replace_durably
 from simulators.frames.responses import Responder, Response
 from simulators.peers.projector_controller import Show
-
-RENDERER = ("appearance", "reconstruction", "simulators")
-"""The packages whose code a response depends on."""
 
 
 @dataclass(frozen=True)
 class Sensor:
     """A 12-bit sensor: counts = black + gain · exposure · radiance.
 
-    At the default gain a 20 ms exposure saturates at 4.0 W/(sr m²): hair under one 8 W/sr lamp at
-    1.2 m answers 0.1 to 1, its glints more. `electrons_per_count` puts the full well at 10,000
-    electrons; `read_noise` is in electrons.
+    At the default gain a 20 ms exposure saturates at 4.0 W/(sr m²); hair under one 8 W/sr lamp at
+    1.2 m has 0.1 to 1, glints more. `electrons_per_count` gives a full well of 10,000 electrons;
+    `read_noise` is in electrons.
     """
 
     full_scale: int = 4095
@@ -56,7 +46,7 @@ class Sensor:
             raise ValueError(f"radiance is not a number at (row, column, channel) {where}")
         rng = np.random.default_rng(seed)
         mean = np.asarray(radiance, np.float64) * (exposure * self.gain * self.electrons_per_count)
-        # Far beyond saturation the noise does not matter, and Poisson draws have a limit.
+        # clipped far beyond saturation: Poisson draws have a limit
         electrons = rng.poisson(np.clip(mean, 0, 1e9)).astype(np.float64)
         electrons += self.read_noise * rng.standard_normal(mean.shape)
         counts = np.rint(electrons / self.electrons_per_count + self.black)
@@ -65,9 +55,9 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The commanded state at a trigger pulse: all that a frame depends on.
+    """The commanded state at a trigger pulse, which determines a frame.
 
-    `power (L,)` is the lamps' share of full intensity; `pose` is where the subject was.
+    `power (L,)` is the lamps' share of full intensity, `pose` the subject's.
     """
 
     pulse: int
@@ -77,13 +67,12 @@ class Snapshot:
 
 
 class FrameMaker:
-    """Makes counts of snapshots and keeps the responses that it needs again.
+    """Makes counts of snapshots, with a cache of responses.
 
-    At pose 0 the lights' responses are kept one by one, so that every light vector is a weighted
-    sum; at other poses, where only the closing frames have lights, one picture per light vector
-    is rendered. Sweeps are kept for the last two poses of each camera. `cache` keeps the lights'
-    responses on disk under `key`, which must name everything that they depend on. Threads may ask
-    for frames of different cameras at the same time.
+    At pose 0 the response of each light is cached, and frames are weighted sums; at other poses,
+    where only closing frames have lights, one image per light vector is rendered. Sweeps are cached
+    for the last two poses of each camera. Threads may request frames of different cameras at the
+    same time.
     """
 
     def __init__(
@@ -92,11 +81,9 @@ class FrameMaker:
         responder: Responder,
         sensor: Sensor,
         seed: int,
-        cache: Path | None = None,
-        key: str = "",
     ) -> None:
         self._rig, self._responder, self._sensor = rig, responder, sensor
-        self._seed, self._cache, self._key = seed, cache, key
+        self._seed = seed
         self._lights: dict[str, Response] = {}
         names = [c.name for c in rig.cameras]
         self._moved = {n: OrderedDict[Hashable, Response]() for n in names}
@@ -109,7 +96,7 @@ class FrameMaker:
         return self._sensor.expose(radiance, exposure, (self._seed, index, shot.pulse))
 
     def counts_at_rest(self, camera: str, shot: Snapshot, exposure: float) -> NDArray[np.uint16]:
-        """`counts (H, W, 3)` of a subject whose poses are all the same: nothing is made twice."""
+        """`counts (H, W, 3)` of a subject without drift: all poses are pose 0."""
         return self.counts(camera, replace(shot, pose=0), exposure)
 
     def radiance(self, camera: str, shot: Snapshot) -> Floats:
@@ -131,12 +118,12 @@ class FrameMaker:
             return
         key = (shot.pose, shot.power.tobytes())
         render = partial(self._responder.lights_together, camera, shot.pose, shot.power)
-        response = _kept(self._moved[camera], key, render, 4)
+        response = _cached(self._moved[camera], key, render, 4)
         flat[response.pixels] += response.images[0]
 
     def _add_projectors(self, flat: Floats, camera: str, shot: Snapshot) -> None:
         render = partial(self._responder.sweep, camera, shot.pose)
-        sweep = _kept(self._sweeps[camera], shot.pose, render, 2)
+        sweep = _cached(self._sweeps[camera], shot.pose, render, 2)
         power = np.float32(shot.show.power)
         for name, response in sweep.items():
             if shot.show.projector is None:
@@ -146,66 +133,12 @@ class FrameMaker:
 
     def _all_lights(self, camera: str) -> Response:
         if camera not in self._lights:
-            file = self._file(camera)
-            if file is not None and file.is_file():
-                with np.load(file) as stored:
-                    self._lights[camera] = Response(stored["pixels"], stored["images"])
-            else:
-                self._lights[camera] = self._responder.lights(camera)
-                if file is not None:
-                    _store(file, self._lights[camera])
+            self._lights[camera] = self._responder.lights(camera)
         return self._lights[camera]
 
-    def _file(self, camera: str) -> Path | None:
-        if self._cache is None:
-            return None
-        name = hashlib.sha256(f"{self._key} {camera}".encode()).hexdigest()[:32]
-        return self._cache / f"lights_{name}.npz"
 
-
-def cache_key(*parts: Any) -> str:
-    """One text for everything that responses depend on; the parts must be ready for JSON.
-
-    The renderer is named in it by its source and the versions of what it stands on: responses that
-    an older one made are not taken for this one's.
-    """
-    return json.dumps([*parts, renderer_digest()], sort_keys=True)
-
-
-def _folder(package: str) -> Path:
-    """Where a package lies; it is not imported, which would cost the wires' process memory."""
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.origin is None:
-        raise ValueError(f"the package {package} has no folder")
-    return Path(spec.origin).parent
-
-
-def renderer_digest(source: Callable[[str], Path] = _folder) -> str:
-    """A digest of all that renders: three packages' source, Mitsuba, Dr.Jit, NumPy and SciPy.
-
-    `source` finds a package's folder.
-    """
-    digest = hashlib.sha256()
-    for name in RENDERER:
-        folder = source(name)
-        for file in sorted(folder.rglob("*.py")):
-            digest.update(f"{name} {file.relative_to(folder).as_posix()}\0".encode())
-            digest.update(file.read_bytes())
-    for library in ("mitsuba", "drjit", "numpy", "scipy"):
-        digest.update(f"{library} {importlib.metadata.version(library)}".encode())
-    return digest.hexdigest()
-
-
-def _store(file: Path, response: Response) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f"{file.stem}.{os.getpid()}.part")
-    with temporary.open("wb") as out:
-        np.savez(out, pixels=response.pixels, images=response.images)
-    replace_durably(temporary, file)
-
-
-def _kept(store: OrderedDict[Any, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
-    """`store[key]`, made where absent; the least recently used beyond `most` goes."""
+def _cached(store: OrderedDict[Any, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
+    """`store[key]`, made if absent; the least recently used beyond `most` is dropped."""
     if key not in store:
         store[key] = make()
     store.move_to_end(key)

@@ -1,4 +1,4 @@
-"""The renderer in a process of its own, so that the wires answer while it works."""
+"""The renderer in a separate process, so that the devices respond meanwhile."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from reconstruction.arrays import Array
 from simulators.frames.responses import Responder, Response
 
 _ENDED_S = 5.0
-"""Until the system says how a process ended whose pipe is closed."""
+"""Seconds until the exit code of a process with a closed pipe is available."""
 
 
 class RenderError(RuntimeError):
-    """The rendering process failed or ended; the message has its reason."""
+    """The rendering process failed or ended; the message has the reason."""
 
 
 class _Remote(ABC):
-    """A `Responder` whose answers are made elsewhere; every call may raise `RenderError`."""
+    """A `Responder` in another process; every call may raise `RenderError`."""
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""
-        answer: Response = self._call("lights", camera)
-        return answer
+        response: Response = self._call("lights", camera)
+        return response
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
         """See `Responder.lights_together`; `power (L,)`."""
-        answer: Response = self._call("lights_together", camera, pose, power)
-        return answer
+        response: Response = self._call("lights_together", camera, pose, power)
+        return response
 
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
         """See `Responder.sweep`."""
-        answer: dict[str, Response] = self._call("sweep", camera, pose)
-        return answer
+        responses: dict[str, Response] = self._call("sweep", camera, pose)
+        return responses
 
     @abstractmethod
     def _call(self, what: str, camera: str, *args: Any) -> Any:
-        """The answer of the responder's method `what`."""
+        """The result of the responder's method `what`."""
 
 
 class RenderProcess(_Remote):
@@ -62,35 +62,33 @@ class RenderProcess(_Remote):
         self._lock = threading.Lock()
 
     def stop(self) -> None:
-        """End the child at once, in mid-picture if need be."""
+        """End the child at once."""
         self._process.terminate()
         self._process.join()
-        with self._lock:  # a call in the middle ends first: it finds the pipe closed at the far end
+        with self._lock:  # a call under way ends first, on the closed pipe
             self._ours.close()
 
     def _call(self, what: str, camera: str, *args: Any) -> Any:
         with self._lock:
             try:
                 self._ours.send((what, (camera, *args)))
-                fine, answer = self._ours.recv()
+                fine, result = self._ours.recv()
             except (OSError, EOFError) as error:
-                self._process.join(_ENDED_S)  # the pipe closes before the system says why
+                self._process.join(_ENDED_S)  # the pipe closes before the exit code is available
                 code = self._process.exitcode
                 raise RenderError(
-                    f"the rendering process ended (exit code {code}) in {what} of {camera}; its "
-                    "last words are on stderr"
+                    f"the rendering process ended (exit code {code}) in {what} of {camera}: see "
+                    "its "
+                    "output on stderr"
                 ) from error
         if not fine:
-            raise RenderError(str(answer))
-        return answer
+            raise RenderError(str(result))
+        return result
 
 
 class RenderPool(_Remote):
-    """A `Responder` of `count` processes; each camera has its own among them.
-
-    Camera number i belongs to process i modulo `count`, as `World` deals its frames to its lanes:
-    calls for cameras of different processes run at the same time.
-    """
+    """A `Responder` of `count` processes. Camera number i belongs to process i modulo `count`, as
+    in `World`; calls for cameras of different processes run at the same time."""
 
     def __init__(self, make: Callable[[], Responder], cameras: Sequence[str], count: int) -> None:
         self._processes = [RenderProcess(make) for _ in range(min(count, len(cameras)))]
@@ -106,9 +104,11 @@ class RenderPool(_Remote):
 
 
 def _serve(pipe: Connection, make: Callable[[], Responder]) -> None:
-    """The child: answers calls until the pipe closes, which the parent's end does, too."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the group; the parent decides
-    os.nice(5)  # the wires come first
+    """The child: serves calls until the pipe is closed."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the group; the parent ends the child
+    os.nice(5)  # the devices come first
     responder = make()
     while True:
         try:
@@ -116,7 +116,7 @@ def _serve(pipe: Connection, make: Callable[[], Responder]) -> None:
         except EOFError:
             return
         try:
-            answer = (True, getattr(responder, what)(*args))
-        except Exception as error:  # whatever it is, the parent tells the camera's client
-            answer = (False, f"{type(error).__name__}: {error}")
-        pipe.send(answer)
+            result = (True, getattr(responder, what)(*args))
+        except Exception as error:  # the camera's client gets the message
+            result = (False, f"{type(error).__name__}: {error}")
+        pipe.send(result)

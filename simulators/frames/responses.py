@@ -1,4 +1,4 @@
-"""What the subject answers to each light: rendered once per camera and pose, in its own process."""
+"""Responses of the subject to each light, rendered once per camera and pose."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Quality:
-    """Paths per pixel and lights per vertex: what a frame costs and how noisy the truth is.
+    """Paths per pixel and lights per vertex, which determine cost and noise of frames.
 
-    `lights` paths serve all lights of a camera at once (see `olat_smoothed`), `sweep` paths all
-    rows of a camera and pose, `together` paths one light vector.
+    `lights` paths are shared by all lights of a camera (see `olat_smoothed`), `sweep` paths by all
+    rows of a camera and pose; `together` paths are for one light vector.
     """
 
     lights: int = 16
@@ -42,7 +42,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Radiance at full level of the pixels that see the subject; every other pixel is dark.
+    """Radiance at full level of the pixels that show the subject; other pixels are dark.
 
     `pixels (P,)` are flat indices, `images (N, P, 3)` in units of `scale`, one for each light or
     row: float32, or float16 for sweeps, whose rounding (0.05 %) is far below a camera's noise.
@@ -69,25 +69,25 @@ class Response:
 
 
 class Responder(Protocol):
-    """Renders responses; slow calls, one at a time."""
+    """Renders responses; calls are slow and not concurrent."""
 
     def lights(self, camera: str) -> Response:
-        """The answer at pose 0 to each light alone, `images (L, P, 3)` in the rig's order."""
+        """The response at pose 0 to each light, `images (L, P, 3)` in the rig's order."""
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """The one answer at `pose`, `images (1, P, 3)`, to all lights at `power (L,)` together."""
+        """The response at `pose`, `images (1, P, 3)`, to all lights at `power (L,)`."""
 
     def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
-        """By projector name: the answer at `pose` to each of its rows, `images (rows, P, 3)`."""
+        """By projector name: the response at `pose` to each of its rows, `images (rows, P, 3)`."""
 
 
 def reproducible(
     rig: Rig, subject: Subject, drift: Drift, quality: Quality, seed: int
 ) -> MitsubaResponder:
-    """A `MitsubaResponder` that gives the same bytes every time, for a process of its own.
+    """A `MitsubaResponder` with reproducible bytes, for a separate process.
 
-    Dr.Jit adds floating-point numbers to the film in the order in which its threads come by; with
-    one thread that order is fixed. Several such processes use several cores.
+    Dr.Jit's sums depend on the order of its threads, so it gets one; several processes use several
+    cores.
     """
     ensure_backend(threads=1)
     return MitsubaResponder(rig, subject, drift, quality, seed)
@@ -96,8 +96,8 @@ def reproducible(
 class MitsubaResponder:
     """Renders with Mitsuba in this process; the scene is built at the first call.
 
-    A moved subject is rendered as the unmoved one under moved cameras, lights and projectors, so
-    one acceleration structure serves all poses.
+    A moved subject is rendered by moving cameras, lights and projectors, so all poses share one
+    acceleration structure.
     """
 
     def __init__(
@@ -111,16 +111,16 @@ class MitsubaResponder:
         from appearance import Sampling
         from appearance.render.smoothed import olat_smoothed
 
-        seen, pixels = self._view(camera, 0)
+        view, pixels = self._view(camera, 0)
         paths = Sampling(self._quality.lights, self._quality.depth, self._seeds(camera, 0, 1))
-        images = olat_smoothed(self._scene, seen, self._rig.lights, paths, pixels=pixels)
+        images = olat_smoothed(self._scene, view, self._rig.lights, paths, pixels=pixels)
         return Response(pixels, images)
 
     def lights_together(self, camera: str, pose: int, power: Array) -> Response:
-        """See `Responder.lights_together`; `power (L,)`. A vertex asks a sample of them."""
+        """See `Responder.lights_together`; `power (L,)`. Vertices sample some of them."""
         from appearance import render_olat
 
-        seen, pixels = self._view(camera, pose)
+        view, pixels = self._view(camera, pose)
         rotation, translation = self._drift.pose(pose)
         lit = [
             replace(light.moved(rotation, translation), intensity=light.intensity * share)
@@ -129,7 +129,7 @@ class MitsubaResponder:
         ]
         images = render_olat(
             self._scene,
-            seen,
+            view,
             lit,
             spp=self._quality.together,
             max_depth=self._quality.depth,
@@ -144,11 +144,11 @@ class MitsubaResponder:
         """See `Responder.sweep`."""
         from appearance import render_scanlines
 
-        seen, pixels = self._view(camera, pose)
+        view, pixels = self._view(camera, pose)
         rotation, translation = self._drift.pose(pose)
         rows = render_scanlines(
             self._scene,
-            seen,
+            view,
             [p.moved(rotation, translation) for p in self._rig.projectors],
             spp=self._quality.sweep,
             max_depth=self._quality.sweep_depth,
@@ -167,11 +167,11 @@ class MitsubaResponder:
     def _view(self, camera: str, pose: int) -> tuple[Camera, Ints]:
         from appearance.render.coverage import covered_pixels
 
-        seen = self._rig.camera(camera).moved(*self._drift.pose(pose))
-        return seen, covered_pixels(self._scene, seen)
+        view = self._rig.camera(camera).moved(*self._drift.pose(pose))
+        return view, covered_pixels(self._scene, view)
 
     def _seeds(self, camera: str, pose: int, what: int) -> int:
-        """Each picture its own paths: noise that all poses shared would look like structure."""
+        """A seed per image: noise shared by all poses would look like structure."""
         index = [c.name for c in self._rig.cameras].index(camera)
         sequence = np.random.SeedSequence([self._seed, index, pose, what])
         return int(sequence.generate_state(1)[0])

@@ -17,7 +17,7 @@ _LONGEST_EXPOSURE = 10.0
 
 
 class CameraLink:
-    """Listens on one port; every connection speaks for the camera that it said hello for."""
+    """Listens on one port; each connection is for the camera of its hello."""
 
     def __init__(self, world: World, sensor: Sensor, host: str, port: int) -> None:
         self._world, self._sensor = world, sensor
@@ -26,7 +26,7 @@ class CameraLink:
         self._stopping = threading.Event()
 
     def start(self) -> int:
-        """Answer from now on; returns the port. Raises `OSError` when it is taken."""
+        """Listen; returns the port. Raises `OSError` if it is taken."""
         self._server = TcpServer("cameras", self._address, self._serve)
         return self._server.port
 
@@ -41,7 +41,7 @@ class CameraLink:
 
 
 class _BadRequest(ValueError):
-    """A request that is answered with an error."""
+    """A request with an error as its response."""
 
 
 class _Connection:
@@ -56,16 +56,16 @@ class _Connection:
                 return
             payload = b""
             try:
-                answer, payload = self._answer(exactly(connection, length))
+                response, payload = self._respond(exactly(connection, length))
             except _BadRequest as error:
-                answer = {"ok": False, "error": str(error)}
+                response = {"ok": False, "error": str(error)}
             while self._camera is not None and self._world.begun("camera", "mute", self._camera):
                 if self._stopping.wait(0.05):
                     return
-            text = json.dumps(answer).encode()
+            text = json.dumps(response).encode()
             connection.sendall(struct.pack(">I", len(text)) + text + payload)
 
-    def _answer(self, message: bytes) -> tuple[dict[str, Any], bytes]:
+    def _respond(self, message: bytes) -> tuple[dict[str, Any], bytes]:
         try:
             request = json.loads(message)
         except ValueError as error:
@@ -112,7 +112,7 @@ class _Connection:
         if failure is not None:
             raise _BadRequest(f"{camera}: the frame could not be made: {failure}")
         payload = frame.counts.result().astype("<u2").tobytes()
-        answer = {
+        response = {
             "ok": True,
             "status": "frame",
             "block_id": frame.block_id,
@@ -121,7 +121,7 @@ class _Connection:
             "left": self._world.held(camera),
             "bytes": len(payload),
         }
-        return answer, payload
+        return response, payload
 
 
 def _exposure(request: dict[str, Any]) -> float:

@@ -38,10 +38,10 @@ DEVICES_FILE = "devices.toml"
 class SimulatedStage:
     """The four peers around a `World`; a context manager.
 
-    With `paced` a light bank on RTU takes the time that its baud rate needs.
-    `configured` is the rig file's `[devices]`; its TCP ports are used, or any free ones with
-    `free_ports` or without it. Inside, `devices` holds the `[devices]` table with the true ports
-    and paths, which `state/devices.toml` holds, too.
+    `configured` is the rig file's `[devices]`; its TCP ports are used, or free ones with
+    `free_ports`. Inside the context `devices`, written to `state/devices.toml`, is the `[devices]`
+    table with the actual ports and paths. With `paced` a light bank on RTU responds at its baud
+    rate.
     """
 
     world: World
@@ -80,7 +80,7 @@ class SimulatedStage:
         if isinstance(light_kind, ModbusTcpConfig):
             light["host"] = light_tcp[0]
         if isinstance(light_kind, ModbusRtuConfig):
-            # A pseudo-terminal has no parity bit; a second stop bit keeps a character as long.
+            # a pseudo-terminal has no parity bit; a second stop bit keeps the length of characters
             light |= {"parity": "N", "stop_bits": 2}
         cameras = CameraLink(world, self.sensor, camera_host, camera_port)
         stack.callback(cameras.stop)
@@ -115,7 +115,7 @@ class SimulatedStage:
 
 
 class Wired(Protocol):
-    """Lamps, whether a lasting fault shows, and the fault of a request, as `World` has them."""
+    """Lamps, active lasting faults, and the fault of a request, see `World`."""
 
     lamps: Lamps
 
@@ -126,10 +126,8 @@ class Wired(Protocol):
 def light_bank(
     config: LightBankConfig, world: Wired, link: Path, tcp: tuple[str, int], paced: bool = False
 ) -> DmxWidget | ModbusRtuPeer | ModbusTcpPeer:
-    """The peer for `config`: at `tcp` (port 0: a free one), or on a serial port at `link`.
-
-    With `paced` a serial line takes the time that its baud rate needs.
-    """
+    """The peer for `config`: at `tcp` (port 0: a free one), or on a serial port at `link`, with
+    `paced` at its baud rate."""
 
     def begun(fault: str) -> bool:
         return world.begun("lights", fault)
@@ -146,7 +144,7 @@ def light_bank(
 
 
 def _toml(table: dict[str, Any], path: str = "") -> str:
-    """`table` as TOML; its values are texts, numbers and tables, which JSON spells as TOML does."""
+    """`table` as TOML, for values that JSON and TOML write alike."""
     plain = {k: v for k, v in table.items() if not isinstance(v, dict)}
     text = "".join(f"{k} = {json.dumps(v)}\n" for k, v in plain.items())
     if path and plain:

@@ -21,8 +21,8 @@ _GARBAGE = b"\x7e\x03\xff\xff\x00\x55"
 class DmxWidget(TerminalPeer):
     """The widget at a pseudo-terminal, and `lamps` as its dimmers from `first_channel` on.
 
-    It has no dead-man: lamps keep their last level whatever happens to the host. A
-    request is told to `strikes` as its label, "6".
+    It has no watchdog: lamps keep their last level if the host stops. `strikes` gets a request's
+    label, "6".
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class DmxWidget(TerminalPeer):
             pending = pending[-_MOST_DATA - 5 :]
 
     def _take(self, label: int, data: bytes) -> bool:
-        """Carry one message out; False where the widget was unplugged."""
+        """Execute one message; False if the widget was unplugged."""
         if self._begun("hang"):
             return True
         fault = self._strikes(str(label))
@@ -57,7 +57,7 @@ class DmxWidget(TerminalPeer):
         if fault is not None and kind == "unplug":
             self._terminal.unplug(fault.seconds)
             return False
-        reply = self._carry_out(label, data)
+        reply = self._execute(label, data)
         if reply is None or kind == "silent":
             return True
         if fault is not None and kind == "late" and self._terminal.stops_within(fault.seconds):
@@ -67,7 +67,7 @@ class DmxWidget(TerminalPeer):
         self._terminal.send(noise if kind == "garbage" else noise + framed)
         return True
 
-    def _carry_out(self, label: int, data: bytes) -> bytes | None:
+    def _execute(self, label: int, data: bytes) -> bytes | None:
         if label == _PARAMETERS and len(data) == 2:
             user_data = bytes(int.from_bytes(data, "little"))
             return struct.pack("<HBBB", _FIRMWARE, _BREAK, _MARK, _RATE) + user_data
@@ -80,7 +80,7 @@ class DmxWidget(TerminalPeer):
 
 
 def _next(data: bytes) -> tuple[int, bytes, bytes] | None:
-    """(label, body, what follows) of the first whole message; what comes before it is skipped."""
+    """(label, body, rest) of the first complete message; bytes before it are skipped."""
     start = data.find(_START)
     while start >= 0 and len(data) >= start + 4:
         label, size = struct.unpack_from("<BH", data, start + 1)

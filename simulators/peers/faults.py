@@ -1,4 +1,4 @@
-"""Faults that a simulated device shows on request, to test what the service does about them."""
+"""Faults injected into simulated devices."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
-"""What can go wrong on a serial line; see `Fault`."""
+"""Faults of a serial line, see `Fault`."""
 _ON_REQUEST = (*SERIAL, "crc", "echo")
 _TRIGGER = ("interlock", "estop", "double", "dropped", "uncounted", "late_trigger")
 _KINDS = {
@@ -26,26 +26,24 @@ class FaultError(ValueError):
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault. `pulse` is the trigger box's count from which, or at which, it shows.
+    """One fault. `pulse` is the trigger box's count at which, or from which on, it occurs.
 
-    camera drop: `camera` misses that pulse, once. camera lost: its frame is made, and lost on the
-    way. camera repeat: its frame has the number of the one before. camera stray: it makes one more
-    frame than was asked for. camera late_frame: the frame is not to be had before the next pulse.
-    camera mute: `camera` answers nothing from that pulse on. trigger interlock or estop: open or
-    pressed after that pulse, for good. trigger double: fires twice, counts once; dropped: counts,
-    does not fire; uncounted: fires, does not count; late_trigger: fires `seconds` late. projectors
-    blank: after that pulse no pattern comes up any more, for good. lights hang: the bank answers
-    nothing after that pulse, and its watchdog goes on; lies: it reports no lamp as lit after that
-    pulse, for good; stuck: the lamps that are lit at that pulse cannot be put off any more.
+    camera: drop misses the pulse; lost loses its frame on the way; repeat gives it the number of
+    the previous frame; stray sends one more frame; late_frame holds it until the next pulse; mute
+    sends no response from then on. trigger: interlock and estop are open or pressed from then on;
+    double fires twice and counts once; dropped counts without firing; uncounted fires without
+    counting; late_trigger fires `seconds` late. projectors: blank shows no pattern from then on.
+    lights: hang sends no response from then on, while the watchdog runs; lies reports no lamp as
+    lit from then on; stuck keeps the lamps lit that are lit at that pulse.
 
-    Serial faults strike once, at the first request from that pulse on that begins with `request`;
-    without it any of the projectors and the lights, and PULSE of the trigger box. The lights'
-    requests begin with function code and address on Modbus ("6 1000": the selector), with the label
-    on DMX. Theirs are also crc: the answer's checksum is wrong (RTU); echo: a write is answered
-    with another value. silent: carried out, not answered. garbage: carried out, the reply is
-    broken. nak: not carried out, answered with an error. late: carried out, answered `seconds`
-    later. noise: carried out, a line of garbage comes before the reply. unplug: the port goes away
-    before it is carried out, and comes back after `seconds`.
+    Serial faults occur once, at the first request from that pulse on that begins with `request`;
+    default: any request of projectors and lights, PULSE of the trigger box. Requests of the lights
+    begin with function code and address on Modbus ("6 1000": the selector), with the label on DMX.
+    silent: executed without reply. garbage: executed, invalid reply. nak: not executed, error
+    reply. late: executed, reply after `seconds`. noise: executed, a line of garbage precedes the
+    reply. unplug: the port disappears before execution and returns after `seconds`. Only the
+    lights: crc, the reply has a wrong checksum (RTU); echo, a write is acknowledged with another
+    value.
     """
 
     device: str
@@ -70,7 +68,7 @@ class Fault:
 
 
 class Faults:
-    """The faults of a run; every device asks here. Safe to call from several threads."""
+    """The faults of a run. Safe to call from several threads."""
 
     def __init__(self, faults: tuple[Fault, ...] = ()) -> None:
         self._left = list(faults)
@@ -104,17 +102,17 @@ class Faults:
         return cls(tuple(faults))
 
     def add(self, fault: Fault) -> None:
-        """Have one more fault, while the devices run."""
+        """Add a fault while the devices run."""
         with self._lock:
             self._left.append(fault)
 
     def at(self, device: str, kind: str, pulse: int, camera: str | None = None) -> Fault | None:
-        """The fault that shows at exactly `pulse`, which is then used up."""
+        """The fault at exactly `pulse`, which is then removed."""
         wanted = (device, kind, pulse, camera)
         return self._use(lambda f: (f.device, f.kind, f.pulse, f.camera) == wanted)
 
     def on_request(self, device: str, request: str, pulse: int) -> Fault | None:
-        """The serial fault that strikes at this request, which is then used up."""
+        """The serial fault of this request, which is then removed."""
         any_request = {"trigger": "PULSE"}.get(device, "")
 
         def strikes(fault: Fault) -> bool:
@@ -133,7 +131,7 @@ class Faults:
         return None
 
     def since(self, device: str, kind: str, pulse: int, camera: str | None = None) -> bool:
-        """Whether this fault has begun by `pulse`; it stays."""
+        """Whether this lasting fault has begun by `pulse`."""
         with self._lock:
             return any(
                 (f.device, f.kind, f.camera) == (device, kind, camera) and f.pulse <= pulse

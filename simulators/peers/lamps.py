@@ -1,4 +1,4 @@
-"""The lamps of the light bank: what was commanded, the sequence, and the watchdog over both."""
+"""The lamps of the light bank: commanded state, sequence, and watchdog."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class NotNow(Exception):
 class Lamps:
     """On/off and level of `count` lamps, and their sequence. Safe to call from several threads.
 
-    While a sequence is armed its entries are lit by `gate`, and the watchdog runs in the dark, too:
-    flashes shorter than its time must not keep it from tripping. Watchdog, interlock and emergency
-    stop leave the sequence.
+    While a sequence is armed its entries are lit by `gate`, and the watchdog also runs in the dark,
+    so that short flashes do not keep it from tripping. Watchdog, interlock and emergency stop
+    disarm the sequence.
 
-    The watchdog needs no thread of its own: whoever looks at the lamps first puts them off where
-    the deadline has passed, so nobody ever sees them lit after it. `clock` is monotonic seconds.
+    The watchdog has no thread: each access puts the lamps off first if the deadline has passed.
+    `clock` is monotonic seconds.
     """
 
     def __init__(self, count: int, clock: Callable[[], float] = time.monotonic) -> None:
         if not 1 <= count <= 1000:
-            raise ValueError(f"the light bank's addresses hold 1 to 1000 lamps, got {count}")
+            raise ValueError(f"expected 1 to 1000 lamps, got {count}")
         self.count = count
         self._clock = clock
         self._lock = threading.RLock()
@@ -53,18 +53,18 @@ class Lamps:
         self._cut: Callable[[], tuple[bool, bool]] = lambda: (False, False)
 
     def cut_by(self, safety: Callable[[], tuple[bool, bool]]) -> None:
-        """Let `safety()` say whether the interlock is open and the emergency stop pressed.
+        """Set `safety()`: whether the interlock is open, and the emergency stop pressed.
 
-        Either cuts the lamps' supply: they go off and stay off until they are commanded again.
+        Either cuts the lamps' supply: they stay off until they are commanded again.
         """
         self._cut = safety
 
     def without_dead_man(self) -> None:
-        """Lamps that stay as they are when nobody speaks any more, as those on DMX."""
+        """Remove the watchdog, as on DMX: lamps stay lit if the host stops."""
         self._dead_man = False
 
     def power(self) -> Array:
-        """Share of full intensity `(L,)` that each lamp gives right now, 0 to 1."""
+        """Present share of full intensity of each lamp `(L,)`, 0 to 1."""
         with self._lock:
             self._look()
             return np.where(self._on | self._stuck, self._level / FULL, 0.0)
@@ -115,7 +115,7 @@ class Lamps:
             self._set(self._level > 0)
 
     def select(self, command: int) -> bool:
-        """The selector's command; False, and nothing happens, where there is no such lamp.
+        """Execute the selector's command; False without effect if there is no such lamp.
 
         Raises `NotNow`.
         """
@@ -128,7 +128,7 @@ class Lamps:
             return True
 
     def load(self, first: int, words: Sequence[int]) -> None:
-        """Write words of the sequence table from word `first`: per entry what to light, level."""
+        """Write words of the sequence table from word `first`: per entry lamp and level."""
         with self._lock:
             self._table.reshape(-1)[first : first + len(words)] = words
 
@@ -138,9 +138,9 @@ class Lamps:
             return [int(word) for word in self._table.reshape(-1)]
 
     def arm(self, entries: int) -> bool:
-        """All lamps off; arm that many entries of the table from the first, or leave it with 0.
+        """All lamps off; arm that many entries of the table, or disarm with 0.
 
-        False, and nothing happens, where the table has fewer or one names a lamp that is not there.
+        False without effect if the table has fewer, or an entry names an unknown lamp.
         """
         with self._lock:
             what = self._table[:entries, 0]
@@ -154,7 +154,7 @@ class Lamps:
             return True
 
     def sequence(self) -> tuple[int, int]:
-        """How many entries are armed, and how often the gate has closed since then."""
+        """Number of armed entries, and of gate closings since then."""
         with self._lock:
             self._look()
             return self._armed, self._position
@@ -177,13 +177,13 @@ class Lamps:
                 self._set(chosen)
 
     def stick(self) -> None:
-        """A fault: the lamps that are lit now cannot be put off any more."""
+        """A fault: lamps that are lit now stay lit."""
         with self._lock:
             self._look()
             self._stuck |= self._on
 
     def beat(self, value: int) -> None:
-        """A heartbeat: feeds the watchdog and clears its bit; lamps that went off stay off."""
+        """A heartbeat: feeds the watchdog and clears its bit; lamps that it put off stay off."""
         with self._lock:
             self._look()
             self._heartbeat = value
@@ -191,13 +191,13 @@ class Lamps:
             self._tripped = False
 
     def owner(self) -> list[int]:
-        """Number and name of who has the bank."""
+        """Number and name of the bank's owner."""
         with self._lock:
             return list(self._owner)
 
     def own(self, first: int, words: Sequence[int]) -> None:
-        """Write the owner's number and name from word `first`; raises `NotNow` for a number while
-        there is another. A new number has no name yet. It decides nothing else."""
+        """Write the owner's number and name from word `first`; raises `NotNow` if another number is
+        set. A new number clears the name."""
         with self._lock:
             if first == 0 and words[0] != self._owner[0]:
                 if words[0] and self._owner[0]:
@@ -206,7 +206,7 @@ class Lamps:
             self._owner[first : first + len(words)] = words
 
     def watch(self, milliseconds: int) -> bool:
-        """Set the watchdog time; False, and nothing happens, when it is out of range."""
+        """Set the watchdog time; False without effect if it is out of range."""
         with self._lock:
             if not WATCHDOG_MS[0] <= milliseconds <= WATCHDOG_MS[1]:
                 return False
@@ -227,7 +227,7 @@ class Lamps:
         if any(self._cut()):
             wanted = np.zeros(self.count, bool)
         if wanted.any() and not self._on.any() and not self._armed:
-            # The time without a heartbeat counts only while a lamp is lit.
+            # the time without a heartbeat counts only while a lamp is lit
             self._fed = max(self._fed, self._clock())
         self._on = wanted
 

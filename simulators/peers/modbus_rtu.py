@@ -17,8 +17,7 @@ _FIXED_ABOVE_BAUD, _FIXED_SILENCE_S = 19200, 1.75e-3
 class ModbusRtuPeer(TerminalPeer):
     """Serves a unit at a pseudo-terminal.
 
-    `paced`: an answer arrives when it would at the line's baud rate, of which a pseudo-terminal
-    knows nothing.
+    `paced`: replies are delayed to the line's baud rate, which a pseudo-terminal ignores.
     """
 
     def __init__(
@@ -43,13 +42,13 @@ class ModbusRtuPeer(TerminalPeer):
             self._take(frame, began)
 
     def _take(self, frame: bytes, began: float) -> None:
-        """Frames with a wrong CRC and those for other units are not for us."""
+        """Ignore frames with a wrong CRC or for other units."""
         if not _SHORTEST <= len(frame) <= _LONGEST or crc(frame) != 0:
             return
         unit, request = frame[0], frame[1:-2]
         if unit not in (self._unit, BROADCAST):
             return
-        reply = self._bank.reply(request, lambda answer: with_crc(bytes([unit]) + answer))
+        reply = self._bank.reply(request, lambda reply: with_crc(bytes([unit]) + reply))
         if reply.unplugged_s is not None:
             self._terminal.unplug(reply.unplugged_s)
         elif reply.frame is not None and unit != BROADCAST:

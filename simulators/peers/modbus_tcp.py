@@ -15,7 +15,7 @@ _NOBODY_THERE = 0x0B
 
 
 class ModbusTcpPeer:
-    """Serves a unit on `port`, 0 for a free one. A host answers for itself as unit 0 and 255, too.
+    """Serves a unit on `port`, 0 for a free one, and as units 0 and 255, which address the host.
 
     Start with `start`, end with `stop`.
     """
@@ -40,7 +40,7 @@ class ModbusTcpPeer:
         self._hang_up()
 
     def _serve(self, connection: socket.socket) -> None:
-        """Answer the requests of one connection until it ends."""
+        """Serve the requests of one connection until it ends."""
         while header := exactly(connection, _HEADER.size):
             transaction, protocol, size, unit = _HEADER.unpack(header)
             if protocol != 0 or not 2 <= size <= _MOST:
@@ -49,8 +49,8 @@ class ModbusTcpPeer:
             if not request:
                 return
 
-            def framed(answer: bytes, about: int = transaction, unit: int = unit) -> bytes:
-                return _HEADER.pack(about, 0, len(answer) + 1, unit) + answer
+            def framed(reply: bytes, about: int = transaction, unit: int = unit) -> bytes:
+                return _HEADER.pack(about, 0, len(reply) + 1, unit) + reply
 
             if unit not in self._units:
                 connection.sendall(framed(bytes([request[0] | 0x80, _NOBODY_THERE])))

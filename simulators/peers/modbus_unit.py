@@ -1,7 +1,7 @@
 """The light bank as a Modbus unit: its registers (docs/reference/wire.md) and functions.
 
-Written from the Modbus Application Protocol Specification 1.1b3; it carries no framing.
-`DisturbedUnit` is the same behind a wire with faults.
+Written from the Modbus Application Protocol Specification 1.1b3, without framing. `DisturbedUnit`
+adds faults.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _WRITES = (5, 6, 15, 16)
 
 
 class Refused(Exception):
-    """The request is answered with the exception `code`."""
+    """The reply is the exception `code`."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}")
@@ -45,10 +45,10 @@ class _Block:
 
 
 class ModbusUnit:
-    """Answers requests for `lamps`; `registers` says where they are, and which are missing.
+    """Executes requests for `lamps`, at the addresses of `registers`.
 
-    A bank without heartbeat or watchdog register has no dead-man. `begun(fault)` says whether a
-    lasting fault shows; of them "lies" matters here: no lamp is reported lit, whatever is.
+    A bank without heartbeat or watchdog register has no watchdog. `begun(fault)` is whether a
+    lasting fault is active; with "lies" no lamp is reported lit.
     """
 
     def __init__(
@@ -81,11 +81,11 @@ class ModbusUnit:
             (r.position, 1, lambda: [lamps.sequence()[1] & 0xFFFF], None),
         )
 
-    def answer(self, request: bytes) -> bytes:
-        """The answer to a request, function code first in both."""
+    def reply(self, request: bytes) -> bytes:
+        """The reply to a request, function code first in both."""
         function = request[0]
         try:
-            return request[:1] + self._carry_out(function, request[1:])
+            return request[:1] + self._execute(function, request[1:])
         except Refused as refused:
             return bytes([function | 0x80, refused.code])
         except NotNow:
@@ -93,7 +93,7 @@ class ModbusUnit:
         except struct.error:
             return bytes([function | 0x80, ILLEGAL_VALUE])
 
-    def _carry_out(self, function: int, data: bytes) -> bytes:
+    def _execute(self, function: int, data: bytes) -> bytes:
         match function:
             case 1:
                 return self._read_coils(*struct.unpack(">HH", data))
@@ -146,26 +146,26 @@ class ModbusUnit:
             values = values[count:]
 
     def _levels(self) -> list[int]:
-        return [self._told(level) for level in self._lamps.levels()]
+        return [self._register_level(level) for level in self._lamps.levels()]
 
     def _dim(self, first: int, levels: Sequence[int]) -> None:
-        self._lamps.dim(first, [self._meant(level) for level in levels])
+        self._lamps.dim(first, [self._lamp_level(level) for level in levels])
 
     def _table(self) -> list[int]:
         words = self._lamps.table()
-        return [self._told(word) if at % 2 else word for at, word in enumerate(words)]
+        return [self._register_level(word) if at % 2 else word for at, word in enumerate(words)]
 
     def _load(self, first: int, words: Sequence[int]) -> None:
-        meant = [self._meant(w) if at % 2 else w for at, w in enumerate(words, first)]
-        self._lamps.load(first, meant)
+        levels = [self._lamp_level(w) if at % 2 else w for at, w in enumerate(words, first)]
+        self._lamps.load(first, levels)
 
-    def _meant(self, level: int) -> int:
-        """The lamps' level for a register's."""
+    def _lamp_level(self, level: int) -> int:
+        """A lamp's level of a register's."""
         _check(level <= self._full)
         return round(level * FULL / self._full)
 
-    def _told(self, level: int) -> int:
-        """The register's level for the lamps'."""
+    def _register_level(self, level: int) -> int:
+        """A register's level of a lamp's."""
         return round(level * self._full / FULL)
 
     def _status(self) -> tuple[int, int]:
@@ -175,7 +175,7 @@ class ModbusUnit:
 
 @dataclass(frozen=True)
 class Reply:
-    """What goes back: nothing where `frame` is None; after `delay_s`; or the link goes away."""
+    """The reply: `frame` (None: none) after `delay_s`, or an unplugged link."""
 
     frame: bytes | None = None
     delay_s: float = 0.0
@@ -183,10 +183,8 @@ class Reply:
 
 
 class DisturbedUnit:
-    """`unit`, its answers framed by `frame`. The fault that `strikes(request)` disturbs one answer.
-
-    A request is told to `strikes` as function code and address, "6 1000".
-    """
+    """A `unit` with faults: `strikes(request)` gives the fault of a request, described by function
+    code and address, "6 1000"."""
 
     def __init__(
         self,
@@ -197,7 +195,7 @@ class DisturbedUnit:
         self._unit, self._strikes, self._begun = unit, strikes, begun
 
     def reply(self, request: bytes, frame: Callable[[bytes], bytes]) -> Reply:
-        """Carry a request out, unless the fault keeps it from that."""
+        """Execute a request, unless a fault prevents it; `frame` frames the reply."""
         if self._begun("hang"):
             return Reply()
         fault = self._strikes(f"{request[0]} {int.from_bytes(request[1:3], 'big')}")
@@ -205,10 +203,10 @@ class DisturbedUnit:
         if fault is not None and kind == "unplug":
             return Reply(unplugged_s=fault.seconds)
         nak = bytes([request[0] | 0x80, FAILURE])
-        answer = nak if kind == "nak" else self._unit.answer(request)
-        if kind == "echo" and answer[0] in _WRITES:
-            answer = answer[:-1] + bytes([answer[-1] ^ 1])
-        framed = frame(answer)
+        reply = nak if kind == "nak" else self._unit.reply(request)
+        if kind == "echo" and reply[0] in _WRITES:
+            reply = reply[:-1] + bytes([reply[-1] ^ 1])
+        framed = frame(reply)
         match kind:
             case "silent":
                 return Reply()
@@ -222,7 +220,7 @@ class DisturbedUnit:
 
 
 def _parts(blocks: list[_Block], address: int, count: int) -> Iterator[tuple[_Block, int, int]]:
-    """(block, offset, count) that make up the span; `Refused` where a register is missing."""
+    """(block, offset, count) of the span; raises `Refused` for a missing register."""
     while count:
         for block in blocks:
             at = address - block.first

@@ -1,4 +1,4 @@
-"""The projector controller: its serial protocol (docs/reference/wire.md) and what it shows."""
+"""The projector controller's serial protocol (docs/reference/wire.md) and state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST_PATTERNS = 1_000_000
 
 @dataclass(frozen=True)
 class Show:
-    """What the projectors show: nothing (level 0), all rows of all, or one row of one."""
+    """The projectors' state: dark (level 0), all rows of all, or one row of one."""
 
     level: int = 0
     projector: str | None = None
@@ -53,11 +53,10 @@ DARK = (Show(), "OFF")
 
 
 class SimulatedProjectorController:
-    """Answers lines; `SerialPeer` carries them. Safe to call from several threads.
+    """Executes request lines of a `SerialPeer`. Safe to call from several threads.
 
-    The watchdog needs no thread of its own: whoever looks first puts the projectors dark where the
-    deadline has passed. `clock` is monotonic seconds; `blank()` says whether a fault keeps
-    patterns from coming up.
+    The watchdog has no thread: each access puts the projectors dark first if the deadline has
+    passed. `clock` is monotonic seconds; `blank()` is whether a fault suppresses patterns.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class SimulatedProjectorController:
 
     @property
     def show(self) -> Show:
-        """What is shown now."""
+        """The present state."""
         with self._lock:
             self._look()
             return self._shown[0]
@@ -105,17 +104,17 @@ class SimulatedProjectorController:
             if closes:
                 self._position += 1
             up = is_open and self._position < len(self._patterns) and not self._blank()
-            self._shown = _said(self._patterns[self._position]) if up else DARK
+            self._shown = _described(self._patterns[self._position]) if up else DARK
 
     def reply(self, line: str) -> str:
-        """The answer to one request; raises `Refusal`."""
+        """The reply to one request; raises `Refusal`."""
         with self._lock:
             self._look()
-            answer = self._carry_out(line.split(" "))
+            reply = self._execute(line.split(" "))
             self._fed = self._clock()
-            return answer
+            return reply
 
-    def _carry_out(self, words: list[str]) -> str:
+    def _execute(self, words: list[str]) -> str:
         match words:
             case ["ID?"]:
                 return f"HAIRSTAGE-PROJECTORS 2 {ENTRIES} {','.join(self._rows)}"
@@ -124,7 +123,7 @@ class SimulatedProjectorController:
             case ["OFF"]:
                 return self._leave(DARK)
             case ["ON", _] | ["LINE", _, _, _]:
-                return self._leave(_said(self._what(words)))
+                return self._leave(_described(self._what(words)))
             case ["WATCHDOG", time_ms]:
                 self._watchdog = whole(time_ms, *WATCHDOG_MS, "watchdog time") / 1000
                 return f"OK WATCHDOG {int(time_ms)}"
@@ -183,7 +182,7 @@ class SimulatedProjectorController:
         return f"OK ARM {len(patterns)} {crc:08x}"
 
     def _leave(self, shown: tuple[Show, str]) -> str:
-        """Show it; no sequence is armed any more."""
+        """Show it and disarm the sequence."""
         self._state, self._shown = "idle", shown
         return f"OK {shown[1]}"
 
@@ -194,8 +193,8 @@ class SimulatedProjectorController:
             self._state, self._shown = "watchdog", DARK
 
 
-def _said(show: Show) -> tuple[Show, str]:
-    """What is shown, with the words for it."""
+def _described(show: Show) -> tuple[Show, str]:
+    """A state with its protocol text."""
     if show.projector is None:
         return show, f"ON {show.level}"
     return show, f"LINE {show.projector} {show.row} {show.level}"

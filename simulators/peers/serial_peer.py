@@ -13,7 +13,7 @@ _NOISE = b"\xff\x00\x1b[A~~\n"
 
 
 class Refusal(Exception):
-    """A request that is answered with `ERR <code> <text>`."""
+    """A request with the reply `ERR <code> <text>`."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
@@ -25,10 +25,8 @@ WATCHDOG_MS = (100, 60_000)
 
 
 class SerialPeer(TerminalPeer):
-    """Answers each line with `reply(line)`, which returns the answer or raises `Refusal`.
-
-    `strikes(line)` is the wire's fault at this request.
-    """
+    """Replies to each line with `reply(line)`, which may raise `Refusal`; `strikes(line)` is the
+    fault of a request."""
 
     def __init__(
         self,
@@ -43,7 +41,7 @@ class SerialPeer(TerminalPeer):
         pending = b""
         while (data := self._terminal.receive()) is not None:
             *lines, pending = (pending + data).split(b"\n")
-            # Of a line that is too long the tail must not pass for a request.
+            # the tail of a too long line must not be taken for a request
             pending = pending[: _LONGEST_LINE + 1]
             for line in lines:
                 if not self._handle(line):
@@ -51,23 +49,23 @@ class SerialPeer(TerminalPeer):
                     break
 
     def _handle(self, line: bytes) -> bool:
-        """Answer one request; False where the port went away or the peer is to stop."""
+        """Reply to one request; False if the port is unplugged or the peer stops."""
         text = line.decode("ascii", "backslashreplace").rstrip("\r")
         fault = self._strikes(text)
         kind = None if fault is None else fault.kind
         if fault is not None and kind == "unplug":
             self._terminal.unplug(fault.seconds)
             return False
-        answer = f"ERR {NOT_NOW} busy" if kind == "nak" else self._answer(line)
+        reply = f"ERR {NOT_NOW} busy" if kind == "nak" else self._reply_to(line)
         if fault is not None and kind == "late" and self._terminal.stops_within(fault.seconds):
             return False
         if kind == "garbage":
-            answer = f"{answer[0]}\x7f{answer[2:]}"
+            reply = f"{reply[0]}\x7f{reply[2:]}"
         if kind != "silent":
-            self._terminal.send((_NOISE if kind == "noise" else b"") + answer.encode() + b"\n")
+            self._terminal.send((_NOISE if kind == "noise" else b"") + reply.encode() + b"\n")
         return True
 
-    def _answer(self, line: bytes) -> str:
+    def _reply_to(self, line: bytes) -> str:
         if len(line.rstrip(b"\r")) > _LONGEST_LINE:
             return f"ERR {UNKNOWN} line too long"
         try:
@@ -79,7 +77,7 @@ class SerialPeer(TerminalPeer):
 
 
 def whole(text: str, low: int, high: int, what: str) -> int:
-    """`text` as a whole number from `low` to `high`; raises `Refusal`."""
+    """`text` as an integer from `low` to `high`; raises `Refusal`."""
     if not (text.isascii() and text.isdecimal()) or not low <= int(text) <= high:
         raise Refusal(BAD_ARGUMENT, f"{what} must be a whole number {low} to {high}")
     return int(text)

@@ -1,4 +1,4 @@
-"""A TCP server whose open connections can be hung up, and reads of so many bytes."""
+"""A TCP server whose connections can be closed, and exact reads."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 
 
 class TcpServer(socketserver.ThreadingTCPServer):
-    """Answers each connection with `serve(connection)` on a thread of its own.
+    """Serves each connection with `serve(connection)` on its own thread.
 
-    Listens once made; raises `OSError` that says `what` when the address is taken.
+    Listens at once; raises `OSError` that names `what` if the address is taken.
     """
 
     daemon_threads = True
@@ -61,7 +61,7 @@ class TcpServer(socketserver.ThreadingTCPServer):
 
 
 def exactly(connection: socket.socket, count: int) -> bytes:
-    """That many bytes, or none where the connection has ended."""
+    """That many bytes, or none if the connection has ended."""
     data = b""
     while len(data) < count:
         part = connection.recv(count - len(data))

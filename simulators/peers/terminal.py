@@ -1,4 +1,4 @@
-"""A pseudo-terminal as a serial port that can be unplugged, and a device behind one."""
+"""A pseudo-terminal as a serial port that can be unplugged, and devices on it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Adapter:
-    """What an RS-485 adapter does to a line: `echo` sends back whatever the client sends; `before`
-    and `after` are bytes that it puts around each answer."""
+    """An RS-485 adapter: `echo` returns the client's bytes; `before` and `after` surround each
+    reply."""
 
     echo: bool = False
     before: bytes = b""
@@ -22,10 +22,9 @@ class Adapter:
 
 
 class Terminal:
-    """The near end of a pseudo-terminal; `link` points to the far one, the client's.
+    """The near end of a pseudo-terminal; `link` points to the client's end.
 
-    One thread receives and sends; `wake` may be called from any. Made plugged in, without a link.
-    `adapter` is what stands between the two ends.
+    One thread receives and sends; `wake` may be called from any.
     """
 
     def __init__(self, link: Path) -> None:
@@ -40,14 +39,14 @@ class Terminal:
         return os.ttyname(self._far)
 
     def make_link(self) -> None:
-        """Let `link` point to the far end."""
+        """Make `link` point to the far end."""
         fresh = self.link.with_name(self.link.name + ".new")
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(self.path)
         fresh.replace(self.link)
 
     def receive(self, within_s: float | None = None) -> bytes | None:
-        """What came; empty when nothing came within `within_s`; None when the peer is to stop."""
+        """Received bytes; empty after `within_s`; None if the peer stops."""
         ready, _, _ = select.select([self._near, self._wake_read], [], [], within_s)
         if self._wake_read in ready:
             return None
@@ -61,12 +60,12 @@ class Terminal:
         os.write(self._near, self.adapter.before + data + self.adapter.after)
 
     def stops_within(self, seconds: float) -> bool:
-        """Wait so long; at once True when the peer is to stop."""
+        """Wait so long; True at once if the peer stops."""
         ready, _, _ = select.select([self._wake_read], [], [], seconds)
         return bool(ready)
 
     def unplug(self, seconds: float) -> None:
-        """The far end hangs up and the link is gone; after `seconds` there are new ones."""
+        """Close the far end and remove the link; after `seconds` make new ones."""
         self._remove_link()
         self._close()
         gone = self.stops_within(seconds)
@@ -75,7 +74,7 @@ class Terminal:
             self.make_link()
 
     def wake(self) -> None:
-        """Have the receiving thread told to stop."""
+        """Make the receiving thread stop."""
         os.write(self._wake_write, b"x")
 
     def close(self) -> None:
@@ -86,7 +85,7 @@ class Terminal:
         os.close(self._wake_write)
 
     def _make(self) -> None:
-        # The far end stays open here, or the near end would fail between two clients.
+        # the far end stays open, or the near end would fail between two clients
         self._near, self._far = os.openpty()
         tty.setraw(self._far)
 
@@ -108,13 +107,13 @@ class TerminalPeer(ABC):
         self._thread = threading.Thread(target=self._run, name=link.name, daemon=True)
 
     def start(self) -> str:
-        """Make the link, answer from now on; returns the link's path."""
+        """Make the link and serve; returns the link's path."""
         self._terminal.make_link()
         self._thread.start()
         return str(self.link)
 
     def stand_behind(self, adapter: Adapter) -> None:
-        """Have this adapter between the client and the device from now on."""
+        """Put this adapter between client and device."""
         self._terminal.adapter = adapter
 
     def stop(self) -> None:
@@ -125,4 +124,4 @@ class TerminalPeer(ABC):
 
     @abstractmethod
     def _run(self) -> None:
-        """Answer until the terminal says to stop."""
+        """Serve until the terminal stops."""

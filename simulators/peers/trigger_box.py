@@ -26,11 +26,11 @@ _SETTLE_US, _EXPOSURE_US, _PERIOD_US = 1_000_000, 10_000_000, 60_000_000
 _MISFIRES = {"double": {"fires": 2}, "dropped": {"fires": 0}, "uncounted": {"counts": 0}}
 _TRIGGER_OUT_S = 0.1
 _LOOK_S = 0.002
-"""How often a waiting table looks at its inputs."""
+"""Seconds between checks of the inputs while a table waits."""
 
 
 class Gated(Protocol):
-    """A device that a gate of the box is wired to."""
+    """A device wired to a gate of the box."""
 
     def gate(self, is_open: bool) -> None: ...
 
@@ -43,10 +43,10 @@ class GatedProjectors(Gated, Protocol):
 
 
 class Wiring(Protocol):
-    """What the trigger box is wired to, as `World` has it: pulses are counted since `reset`.
+    """The wiring of the trigger box, see `World`; pulses are counted since `reset`.
 
-    `pulse` fires the cameras and returns the count with this pulse; `safety` says whether the
-    interlock is open, and whether the emergency stop is pressed.
+    `pulse` fires the cameras and returns the count; `safety` is whether the interlock is open, and
+    the emergency stop pressed.
     """
 
     @property
@@ -62,7 +62,7 @@ class Wiring(Protocol):
 
 @dataclass(frozen=True)
 class Row:
-    """`repeat` steps alike; times in seconds. `text` is what the checksum is made of."""
+    """`repeat` equal steps; times in seconds. `text` is for the checksum."""
 
     repeat: int
     gates: str
@@ -77,7 +77,7 @@ class _Stopped(Exception):
 
 
 class SimulatedTriggerBox:
-    """Answers lines, which `SerialPeer` carries, and runs its table on a thread of its own.
+    """Executes request lines of a `SerialPeer`, and runs its table on its own thread.
 
     End with `stop`. The lock is held while the table acts and released while it waits.
     """
@@ -104,15 +104,15 @@ class SimulatedTriggerBox:
             self._runner.join()
 
     def reply(self, line: str) -> str:
-        """The answer to one request; raises `Refusal`."""
+        """The reply to one request; raises `Refusal`."""
         if line.startswith("PULSE "):
-            self._delay()  # before the lock: a box that fires late answers late, and knows no more
+            self._delay()  # before the lock: a late box replies late
         with self._changed:
-            answer = self._carry_out(line.split(" "))
+            reply = self._execute(line.split(" "))
             self._fed = time.monotonic()  # not by refusals: noise must not feed it
-            return answer
+            return reply
 
-    def _carry_out(self, words: list[str]) -> str:
+    def _execute(self, words: list[str]) -> str:
         match words:
             case ["ID?"]:
                 return f"HAIRSTAGE-TRIGGER 2 {TABLE_ROWS}"
@@ -248,7 +248,7 @@ class SimulatedTriggerBox:
             self._until(time.monotonic() + _LOOK_S)
 
     def _until(self, moment: float) -> None:
-        """Wait, looking at what may end the table; raises `_Stopped` when it has ended."""
+        """Wait while checking the inputs; raises `_Stopped` when the table has ended."""
         while True:
             interlock, estop = self._wiring.safety()
             if estop or interlock:

@@ -1,4 +1,4 @@
-"""How the subject moves while the sweep is shot: a smooth, seeded random walk."""
+"""Motion of the subject during the sweep: a smooth, seeded random walk."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _CROWN = np.array([0.012, 0.045, 0.112])  # the whorl sits behind and beside the
 
 @dataclass(frozen=True)
 class Groom:
-    """What makes one style. Lengths in metres, `wave_*` of the offset across the strand."""
+    """Parameters of a style. Lengths in metres, `wave_*` of the offset across the strand."""
 
     strands: int
     length: tuple[float, float]
@@ -31,11 +31,11 @@ class Groom:
     lift: float  # thickness of the hair over the scalp, metres
     fringe: float  # hair from above the forehead is cut to this share of its length
     clumps: int
-    clumping: float  # share of the way to the clump's middle that tips have gone
+    clumping: float  # how far tips move to the clump's centre, 0 to 1
     wave_radius: float
     wave_pitch: float
     helix: float  # 0: waves in one direction, 1: ringlets
-    frizz: float  # single strands' own wander at the tip, metres
+    frizz: float  # random offset of a strand's tip, metres
 
 
 GROOMS = {
@@ -118,8 +118,8 @@ def hair_field(cell: float = 0.004) -> HeadField:
 
 
 def _hair_distance(p: Array) -> Array:
-    """What hair slides along, metres `(...)` at `p (..., 3)`: the skin on an endless neck, filled
-    in front so that hair passes beside the face."""
+    """Signed distance `(...)`, metres, at `p (..., 3)` to the surface under the hair: the skin with
+    an infinite neck, filled in front so that hair passes the face."""
     lifted = p.copy()
     lifted[..., 2] = NECK_END + 0.01
     skin = skin_distance(np.where(p[..., 2:] < NECK_END + 0.01, lifted, p))
@@ -128,9 +128,9 @@ def _hair_distance(p: Array) -> Array:
 
 
 def covering_radius(strands: int) -> float:
-    """Strand radius (metres) with which `strands` cover what a whole head of hair covers.
+    """Radius, metres, at which `strands` have the coverage of 100,000 fibres of 40 µm radius.
 
-    100,000 fibres of 40 µm radius; 0.35 mm for 11,400 strands. Between 40 µm and 1 mm.
+    Between 40 µm and 1 mm; 0.35 mm for 11,400 strands.
     """
     return float(np.clip(_COVERAGE / max(strands, 1), 40e-6, 1e-3))
 
@@ -156,10 +156,10 @@ def grow(groom: Groom, head: Mesh, seed: int, count: int | None = None) -> Stran
 def _roots(head: Mesh, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Points `(S, 3)` spread evenly by area over the scalp, and smooth normals there."""
     if head.scalp is None or not head.scalp.any():
-        raise ValueError("hair needs a head whose scalp faces are marked, and this one has none")
+        raise ValueError("the head has no marked scalp faces")
     faces = np.flatnonzero(head.scalp)
     area = np.cumsum(head.face_areas()[faces])
-    # One draw per equal slice of area: even cover without the clots of independent draws.
+    # stratified by area
     at = (np.arange(count) + rng.random(count)) / count * area[-1]
     face = head.faces[faces[np.searchsorted(area, at).clip(max=len(faces) - 1)]]
     u, v = rng.random((2, count))
@@ -181,7 +181,7 @@ def _lengths(groom: Groom, roots: Array, rng: np.random.Generator) -> Array:
 
 
 def _comb(groom: Groom, points: Array) -> Array:
-    """Directions `(S, 3)` in which the hair was combed away from the parting or the whorl."""
+    """Combing directions `(S, 3)`, away from the parting or the whorl."""
     away = points - _CROWN
     if groom.parting_x is None:
         return _unit(away * [1, 1, 0.6])
@@ -204,7 +204,7 @@ def _step(
     comb = _comb(groom, roots)
     comb = _unit(comb - (comb * normals).sum(1, keepdims=True) * normals)
     comb = _unit(comb + 0.08 * rng.normal(size=comb.shape))
-    # Hair from above lies over hair from below; a random share mixes the layers.
+    # hair from above lies over hair from below; a random part mixes the layers
     height = np.clip((roots[:, 2] + 0.05) / 0.165, 0, 1)
     layer = groom.lift * (0.10 + 0.55 * height + 0.35 * rng.random(count))
     sway = 0.25 * rng.normal(size=(count, 3)) * [1, 1, 0.2]
@@ -222,7 +222,7 @@ def _step(
         shell = layer * (1 - np.exp(-s / 0.012))
         short = np.maximum(shell - distance, 0)
         p = p + short[:, None] * out
-        # Sliding: what pointed into the head is taken out of the direction.
+        # sliding: remove the component into the head
         into = np.minimum((direction * out).sum(1), 0) * (short > 0)
         direction = _unit(direction - into[:, None] * out)
         moved = _unit(p - paths[:, k - 1])
@@ -234,7 +234,7 @@ def _step(
 def _clump_and_wave(
     groom: Groom, paths: Array, normals: Array, length: Array, rng: np.random.Generator
 ) -> Array:
-    """Draw strands towards clump middles, then offset whole clumps along a wave or a helix."""
+    """Draw strands towards clump centres, then offset clumps along a wave or a helix."""
     count, steps, _ = paths.shape
     guides = rng.choice(count, min(groom.clumps, count), replace=False)
     lock = _nearest(paths[guides, 0], paths[:, 0])
@@ -247,7 +247,7 @@ def _clump_and_wave(
     near = np.logical_and.accumulate(near, axis=1)
     weight = tight[:, None] * along**0.8 * near
     out = paths + weight[..., None] * (paths[guide] - paths)
-    # A lock waves as one: its middle's frame, which turns little along the strand, serves all.
+    # all strands of a lock use the frame of its centre
     tangent = _unit(np.gradient(paths[guides], axis=1))
     across = _unit(np.cross(tangent, normals[guides][:, None] + 1e-3))
     binormal = np.cross(tangent, across)
@@ -263,7 +263,7 @@ def _clump_and_wave(
 
 
 def _lock_phases(groom: Groom, roots: Array, rng: np.random.Generator) -> Array:
-    """Phases of the locks at `roots (G, 3)`: waves line up over the head, ringlets do not."""
+    """Phases of the locks at `roots (G, 3)`, coherent for waves, random for ringlets."""
     waves = rng.normal(size=(4, 3)) * 18.0
     smooth = np.sin(roots @ waves.T + rng.uniform(0, 2 * np.pi, 4)).sum(axis=1)
     spread = 0.4 + (np.pi - 0.4) * groom.helix**2
@@ -271,7 +271,7 @@ def _lock_phases(groom: Groom, roots: Array, rng: np.random.Generator) -> Array:
 
 
 def _push_out(paths: Array, field: HeadField) -> Array:
-    """Points moved out of the head along the field, more clearance after the root."""
+    """Points moved out of the head along the field, with clearance that grows from the root."""
     count, steps, _ = paths.shape
     clear = np.minimum(np.arange(steps) * 0.0004, 0.0015)
     flat = paths.reshape(-1, 3)

@@ -1,12 +1,11 @@
-"""What stands on the stage to calibrate it: a ChArUco board, a mirror or a diffuse sphere.
+"""Calibration targets: a ChArUco board, a mirror or a diffuse sphere.
 
-They are convex and alone, so no light reaches them by way of anything else: casting rays with the
-cameras' own model, lenses included, is exact where a path tracer would be noisy.
+They are convex and alone, so they have no indirect light, and ray casting with the cameras' lens
+model is exact.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,12 +19,12 @@ from reconstruction.calibration.boards import Board
 from reconstruction.geometry.cameras import facing
 from simulators.frames.responses import Response
 
-LAMP_RADIUS = 4e-3  # metres: what a mirror shows of a lamp that is called a point
+LAMP_RADIUS = 4e-3  # metres, of lamps without a radius
 
 
 @dataclass(frozen=True, eq=False)
 class PropSamples:
-    """Samples that a camera takes of a prop, `(P, S)` of them in the flat `pixels (P,)`.
+    """Samples `(P, S)` of a prop in the flat `pixels (P,)` of a camera.
 
     `points` and `normals (P, S, 3)`, and `albedo (P, S)`, 0 where the ray misses.
     """
@@ -49,7 +48,7 @@ class BoardProp:
     white: float = 0.8
     black: float = 0.04
 
-    def see(self, camera: Camera, offsets: Array) -> PropSamples:
+    def sample(self, camera: Camera, offsets: Array) -> PropSamples:
         """Samples at pixel centres plus `offsets (S, 2)`."""
         pixels, rays = _rays(camera, offsets, self._outline())
         origin = (camera.center - self.translation) @ self.rotation
@@ -65,10 +64,6 @@ class BoardProp:
         points = camera.center + distance[..., None] * rays
         normal = np.broadcast_to(-self.rotation[:, 2], points.shape)
         return PropSamples(pixels, points, normal, albedo)
-
-    def digest(self) -> str:
-        """A text of everything that frames depend on."""
-        return json.dumps([str(self.board), self.white, self.black, self.to_dict()])
 
     def to_dict(self) -> dict[str, Any]:
         """The true pose, ready for JSON."""
@@ -90,7 +85,7 @@ class SphereProp:
     albedo: float
     mirror: bool = False
 
-    def see(self, camera: Camera, offsets: Array) -> PropSamples:
+    def sample(self, camera: Camera, offsets: Array) -> PropSamples:
         """Samples at pixel centres plus `offsets (S, 2)`."""
         box = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
         pixels, rays = _rays(camera, offsets, self.centre + self.radius * box)
@@ -101,10 +96,6 @@ class SphereProp:
         points = camera.center + distance[..., None] * rays
         normals = (points - self.centre) / self.radius
         return PropSamples(pixels, points, normals, np.where(inside > 0, self.albedo, 0.0))
-
-    def digest(self) -> str:
-        """A text of everything that frames depend on."""
-        return json.dumps(self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """The true place, ready for JSON."""
@@ -130,7 +121,7 @@ def board_pose(number: int, board: Board) -> BoardProp:
 
 
 class PropResponder:
-    """Answers as `responses.Responder` does; the prop stands still at every pose."""
+    """A `Responder` of a prop, which is the same at every pose."""
 
     def __init__(self, rig: Rig, prop: Prop, samples: int = 4) -> None:
         self._rig, self._prop, self._samples = rig, prop, samples
@@ -140,7 +131,7 @@ class PropResponder:
         device = self._rig.camera(camera)
         if isinstance(self._prop, SphereProp) and self._prop.mirror:
             return _glints(self._prop, device, self._rig.lights)
-        seen = self._prop.see(device, _offsets(device, self._samples))
+        seen = self._prop.sample(device, _offsets(device, self._samples))
         points, normals, albedo = seen.points, seen.normals, seen.albedo
         if isinstance(self._prop, BoardProp):  # light varies little over a pixel of a plane
             points, normals = points.mean(axis=1, keepdims=True), normals[:, :1]
@@ -161,7 +152,7 @@ class PropResponder:
     def sweep(self, camera: str, pose: int) -> dict[str, Response]:
         """See `Responder.sweep`."""
         device = self._rig.camera(camera)
-        seen = self._prop.see(device, _offsets(device, self._samples))
+        seen = self._prop.sample(device, _offsets(device, self._samples))
         mirror = isinstance(self._prop, SphereProp) and self._prop.mirror
         out = {}
         for p in self._rig.projectors:
@@ -182,10 +173,9 @@ class PropResponder:
 
 
 def reflection(eye: Array, lamp: Array, centre: Array, radius: float) -> Array:
-    """Where `(N, 3)` a mirror sphere shows `lamp (N, 3)` to `eye (3,)`; NaN where it does not.
+    """Reflection points `(N, 3)` of `lamp (N, 3)` to `eye (3,)` on a mirror sphere; NaN if none.
 
-    Alhazen's problem, by bisection in the plane of eye, lamp and centre: the angles of incidence
-    and of reflection grow in opposite directions.
+    Alhazen's problem, by bisection in the plane of eye, lamp and centre.
     """
     a, b = eye - centre, lamp - centre
     ra, rb = np.linalg.norm(a), np.linalg.norm(b, axis=-1)
@@ -200,16 +190,16 @@ def reflection(eye: Array, lamp: Array, centre: Array, radius: float) -> Array:
         rest = whole - middle
         out = np.arctan2(rb * np.sin(rest), rb * np.cos(rest) - radius)
         low, high = np.where(into < out, middle, low), np.where(into < out, high, middle)
-    seen = into < np.pi / 2
+    visible = into < np.pi / 2
     at = centre + radius * (np.cos(middle)[:, None] * x + np.sin(middle)[:, None] * y)
-    return np.where(seen[:, None], at, np.nan)
+    return np.where(visible[:, None], at, np.nan)
 
 
 def _glints(sphere: SphereProp, camera: Camera, lights: Sequence[Light]) -> Response:
-    """Highlights: each lamp a disc of points, whose flux goes to the pixels they are seen in.
+    """Highlights: each lamp is a disc of points, whose flux is added to their pixels.
 
-    A point of a lamp of area A has the radiance I / A; seen through the sphere it covers A times
-    the mapping's determinant, pixels for square metres.
+    A point of a lamp of area A has the radiance I / A; its image covers A times the mapping's
+    determinant, in pixels per square metre.
     """
     rng = np.random.default_rng(5)
     points = 256
@@ -257,7 +247,7 @@ def _offsets(camera: Camera, n: int) -> Array:
 
 
 def _rays(camera: Camera, offsets: Array, around: Array) -> tuple[Ints, Array]:
-    """Flat pixels `(P,)` about the picture of points `around (N, 3)`, and rays `(P, S, 3)`."""
+    """Flat pixels `(P,)` that contain the points `around (N, 3)`, and rays `(P, S, 3)`."""
     at, depth = camera.project(around)
     low, high = np.floor(at.min(axis=0)) - 2, np.ceil(at.max(axis=0)) + 3
     if not (depth > 0).all():
@@ -270,7 +260,7 @@ def _rays(camera: Camera, offsets: Array, around: Array) -> tuple[Ints, Array]:
 
 
 SPHERES = np.array([[0.0, 0, 0.02], [-0.06, 0.08, -0.05], [0.05, -0.09, -0.02], [0.02, 0.06, 0.08]])
-"""Centres of a sphere in its places, metres."""
+"""Positions of a sphere, metres."""
 
 
 def named_prop(name: str) -> Prop | None:

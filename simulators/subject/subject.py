@@ -1,8 +1,7 @@
-"""The subject in front of the cameras: a procedural one by name, or any strand file."""
+"""The subject: a procedural one by name, or a strand file."""
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ _FILE_SKIN = (0.42, 0.30, 0.24)
 
 
 class SubjectError(ValueError):
-    """A subject that cannot sit in this stage; the message says why and what to do."""
+    """A subject that does not fit this stage; the message has the reason and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +47,6 @@ class Subject:
     hair: HairAppearance
     skin: tuple[float, float, float]
 
-    def digest(self) -> str:
-        """A hash of everything that frames depend on."""
-        head = (self.head.vertices, self.head.faces) if self.head is not None else ()
-        radius = np.asarray(self.strands.radius, np.float64)
-        total = hashlib.sha256(repr((self.hair, self.skin)).encode())
-        for array in (self.strands.points, self.strands.offsets, radius, *head):
-            total.update(repr((array.shape, str(array.dtype))).encode())
-            total.update(np.ascontiguousarray(array).tobytes())
-        return total.hexdigest()
-
 
 def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subject:
     """The procedural subject `wavy`, `straight` or `curly`; `strands` overrides their number.
@@ -66,11 +55,11 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
     """
     if name not in GROOMS:
         raise SubjectError(
-            f"no subject called {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
+            f"unknown subject {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
             f"({', '.join(READABLE)})"
         )
     head = generic_head()
-    # The three grooms of one seed are three heads of hair, not one with three settings.
+    # the seed depends on the name, so that the grooms differ in every strand
     draw = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
     hair = grow(GROOMS[name], head, draw, strands)
     return Subject(name, hair, head, _APPEARANCE[name], _SKIN[name])
@@ -85,24 +74,22 @@ def load_subject(
 ) -> Subject:
     """A procedural subject by name, or the strands of a file on the OBJ `head`.
 
-    Strands of a file keep their radius where they cover at least half of what a whole head of hair
-    does (100,000 fibres of 40 µm); a thinned groom gets the radius that keeps that coverage, and
-    `say` gets a line about it. Raises `SubjectError`, or `ValueError` of the reader.
+    If the strands of a file cover less than half of 100,000 fibres of 40 µm radius, they get the
+    radius with that coverage, and `say` gets a line about it. Raises `SubjectError`, or
+    `ValueError` of the reader.
     """
     path = Path(name_or_file)
     if name_or_file in GROOMS:
         if head is not None:
-            raise SubjectError(
-                f"the subject {name_or_file!r} brings its own head: leave out {head}"
-            )
+            raise SubjectError(f"the subject {name_or_file!r} has its own head: leave out {head}")
         return make_subject(name_or_file, seed)
     if not path.is_file():
         raise SubjectError(
-            f"no subject {name_or_file!r}: neither a file nor one of {', '.join(GROOMS)}"
+            f"unknown subject {name_or_file!r}: expected a file or one of {', '.join(GROOMS)}"
         )
     strands = read_strands(path)
     if len(strands) == 0:
-        raise SubjectError(f"{path}: holds no strands")
+        raise SubjectError(f"{path}: no strands")
     wanted = covering_radius(len(strands))
     given = float(np.mean(strands.radius))
     if given < 0.5 * wanted:
@@ -117,7 +104,8 @@ def load_subject(
 
 
 def check_fits(subject: Subject, rig: Rig) -> None:
-    """Raise `SubjectError` unless every camera sees half of the hair or is half filled by it."""
+    """Raise `SubjectError` unless each camera has half of the hair in view or is half filled by
+    it."""
     points = subject.strands.points.astype(float)
     for camera in rig.cameras:
         pixels, depth = camera.project(points)
@@ -126,8 +114,9 @@ def check_fits(subject: Subject, rig: Rig) -> None:
         if share < 0.5 and _filled(camera, pixels[on]) < 0.5:
             low, high = points.min(axis=0).round(3), points.max(axis=0).round(3)
             raise SubjectError(
-                f"subject {subject.name}: {camera.name} of rig {rig.name} sees only {share:.0%} of "
-                f"the hair, which spans {low} to {high} m; the stage expects metres, z up, face "
+                f"subject {subject.name}: only {share:.0%} of the hair is in the view of "
+                f"{camera.name} of rig {rig.name}; it spans {low} to {high} m; the stage expects "
+                "metres, z up, face "
                 "towards −y, the head's centre at the origin: convert the file"
             )
 

@@ -1,4 +1,4 @@
-"""The truth behind the simulated frames, written for those who judge results by it."""
+"""The ground truth of simulated frames, for evaluation."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ EXPOSURES = "exposures.jsonl"
 def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
     """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`.
 
-    All at pose 0. Of a prop, which stands still, `prop.json` instead. `exposures.jsonl` beside
-    them, begun empty here and continued by `World`, says the pose of each pulse.
+    All at pose 0; for a prop `prop.json` instead. `exposures.jsonl`, created empty here and written
+    by `World`, has the pose of each pulse.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / EXPOSURES).write_text("")

@@ -1,8 +1,8 @@
-"""Files that others made, decoded in a process of its own, with limits.
+"""Untrusted files, decoded in a separate process with limits.
 
-A picture of 0.4 MB may unpack to gigabytes, and a damaged one may end the process that reads it:
-neither is to happen in the process that runs the lamps. `Decoder` starts the other process
-(`python -m stage_service.decoding`) and checks what comes back from it.
+An image of 0.4 MB may unpack to gigabytes, and a damaged one may crash its reader, which must not
+happen in the process that runs the lamps. `Decoder` starts the other process
+(`python -m stage_service.decoding.server`) and validates its responses.
 """
 
 from stage_service.decoding.decoder import Decoder as Decoder

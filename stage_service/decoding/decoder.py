@@ -1,4 +1,4 @@
-"""The service's side: starts the decoder's process, asks it, checks its answers."""
+"""Client of the decoder's process: starts it, sends requests, validates responses."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from stage_service.decoding.limits import FRAMES, GIVEN, Limits
 
 log = logging.getLogger("hairstage.decoding")
 START_S = 60.0
-"""Until the process has loaded its libraries, on a busy machine."""
+"""Deadline for the process to load its libraries."""
 GRACE_S = 10.0
-"""Beyond its own limit of seconds, until a fork that does not answer is given up."""
+"""Seconds beyond a fork's own limit until it is given up."""
 END_S = 5.0
 WAIT_S = 30.0
-"""How long a file waits for its turn."""
+"""Seconds that a file waits for its turn."""
 KEPT_ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_", "LD_", "PYTHON", "TMPDIR", "DRJIT_", "TZ")
-"""What the process is told of the service's environment: no tokens, no database's password."""
+"""Environment variables passed to the process: no tokens, no database password."""
 FEW_THREADS = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1"),
     "OPENCV_LOG_LEVEL": "SILENT",
 }
-ENDED = "it ended the process that was to decode it: it is damaged, or needs too much memory"
+ENDED = "decoding it crashed: the file is damaged, or needs too much memory"
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class Undecodable(ValueError):
-    """A file that cannot be decoded, or takes more than a limit: the message names both. `kind` is
-    the name of the error's class in the decoder."""
+    """A file that cannot be decoded or exceeds a limit; the message names file and reason. `kind`
+    is the class name of the decoder's error."""
 
     def __init__(self, message: str, kind: str = "") -> None:
         super().__init__(message)
@@ -53,11 +53,11 @@ class Undecodable(ValueError):
 
 
 class DecoderBusy(RuntimeError):
-    """Other files are being decoded, or there is no process to decode in."""
+    """Other files are being decoded, or the process cannot be started."""
 
 
 class Lane:
-    """Places for files of one kind: `places` at the same time, `waiting` more wait for `WAIT_S`."""
+    """A queue of files of one kind: `places` at a time, `waiting` more wait up to `WAIT_S`."""
 
     def __init__(self, places: int, waiting: int, limits: Limits) -> None:
         self.limits = limits
@@ -65,13 +65,15 @@ class Lane:
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Have a place. Raises `DecoderBusy`."""
+        """Hold a place. Raises `DecoderBusy`."""
         if not self._room.acquire(blocking=False):
-            raise DecoderBusy("too many files wait to be decoded: ask again in some seconds")
+            raise DecoderBusy(
+                "too many files are waiting to be decoded: repeat the request in some seconds"
+            )
         try:
             if not self._free.acquire(timeout=WAIT_S):
                 raise DecoderBusy(
-                    f"other files have been decoded for {WAIT_S:g} s: ask again in some seconds"
+                    f"no decoder was free within {WAIT_S:g} s: repeat the request in some seconds"
                 )
             try:
                 yield
@@ -84,13 +86,13 @@ class Lane:
 class Decoder:
     """Decodes files in another process, started when it is first needed, kept until `close`.
 
-    Files of captures, files from requests and maps do not wait for each other. All methods may be
+    Files of captures, files from requests and maps do not wait for each other. Methods may be
     called from any thread; they raise `Undecodable`, `DecoderBusy`, and `FileNotFoundError` for a
-    path where nothing is.
+    missing path.
     """
 
     def __init__(self) -> None:
-        # As many frames wait as a console of many cameras asks for at once.
+        # a console requests the frames of all cameras at once
         self.frames = Lane(2, 24, FRAMES)
         self.given, self.maps = Lane(1, 4, GIVEN), Lane(1, 4, GIVEN)
         self._lock = threading.Lock()
@@ -99,55 +101,55 @@ class Decoder:
         self._closed = False
 
     def start(self) -> None:
-        """Start the process now, so that the first file waits for nothing."""
+        """Start the process now."""
         with self._lock:
             self._running()
 
     def warm_up(self) -> None:
-        """Start the process beside all else."""
+        """Start the process in the background."""
 
         def start() -> None:
             try:
                 self.start()
-            except (DecoderBusy, OSError) as error:  # whoever needs it tries again, and is told
+            except (DecoderBusy, OSError) as error:  # the next request tries again
                 log.warning("no decoder could be started: %s", error)
 
         beside(start, "decoder")
 
     def close(self) -> None:
-        """End the process, whatever it is at."""
+        """End the process at once."""
         with self._lock:
             self._closed = True
             self._end()
 
     def preview(self, file: Path, **look: Any) -> bytes:
         """A PNG of a frame, as `png_of_frame` makes it with `look`."""
-        _, (png,) = self._ask(self.frames, "preview", file, str(file), look, count=1)
+        _, (png,) = self._request(self.frames, "preview", file, str(file), look, count=1)
         if not png.startswith(PNG):
-            raise Undecodable(f"{file}: the decoder answered with something that is no PNG")
+            raise Undecodable(f"{file}: the decoder returned no PNG")
         return bytes(png)
 
     def figures(self, file: Path) -> dict[str, Any]:
-        """How a frame is exposed."""
-        head, _ = self._ask(self.frames, "figures", file, str(file), {})
+        """Exposure and sharpness of a frame."""
+        head, _ = self._request(self.frames, "figures", file, str(file), {})
         return dict(head["figures"])
 
     def board(
         self, capture: Path, camera: str, board: Sequence[Any], calibrated: Path | None
     ) -> dict[str, Any]:
-        """What a camera's lit frame in `capture` shows of a board; see `board_view`."""
-        asked = {
+        """The board in a camera's lit frame of `capture`; see `board_view`."""
+        options = {
             "camera": camera,
             "board": list(board),
             "calibrated": None if calibrated is None else str(calibrated.resolve()),
         }
         name = f"{capture}, {camera}"
-        head, _ = self._ask(self.frames, "board", capture.resolve(), name, asked)
+        head, _ = self._request(self.frames, "board", capture.resolve(), name, options)
         return dict(head["board"])
 
     def head(self, source: Path | bytes, name: str) -> Mesh:
-        """The head of an OBJ file, or of the bytes of one that is called `name`."""
-        head, parts = self._ask(self.given, "head", source, name, {}, count=None)
+        """The head of an OBJ file, given as a path or as bytes with a `name`."""
+        head, parts = self._request(self.given, "head", source, name, {}, count=None)
         shapes = [("<f8", (None, 3)), ("<i8", (None, 3)), ("|b1", (None,))]
         arrays = _arrays(name, head, parts, shapes[: len(parts)])
         try:
@@ -158,26 +160,26 @@ class Decoder:
     def mask(self, source: Path | bytes, name: str, width: int, height: int) -> Bools:
         """A hair mask `(height, width)`."""
         size = {"width": width, "height": height}
-        head, parts = self._ask(self.given, "mask", source, name, size, count=1)
+        head, parts = self._request(self.given, "mask", source, name, size, count=1)
         return _arrays(name, head, parts, [("|b1", (height, width))])[0]
 
     def map_weights(
         self, data: bytes, name: str, kind: str, rotation_deg: float, lights: Sequence[Light]
     ) -> Array:
-        """What each light is multiplied by to stand for an environment map: `(L, 3)`."""
-        asked = {
+        """Weights `(L, 3)` of the lights that represent an environment map."""
+        options = {
             "kind": kind,
             "rotation_deg": rotation_deg,
             "positions": [x.position.tolist() for x in lights],
             "intensities": [x.intensity_towards(np.zeros(3)).tolist() for x in lights],
         }
-        head, parts = self._ask(self.maps, "map_weights", data, name, asked, count=1)
+        head, parts = self._request(self.maps, "map_weights", data, name, options, count=1)
         (weights,) = _arrays(name, head, parts, [("<f8", (len(lights), 3))])
         if not np.isfinite(weights).all():
-            raise Undecodable(f"{name}: its light is not finite")
+            raise Undecodable(f"{name}: its radiance is not finite")
         return weights
 
-    def _ask(
+    def _request(
         self,
         lane: Lane,
         operation: str,
@@ -186,7 +188,7 @@ class Decoder:
         options: dict[str, Any],
         count: int | None = 0,
     ) -> tuple[dict[str, Any], list[bytearray]]:
-        """The answer about a file that is called `name`, of `count` parts (None: any)."""
+        """The response about a file called `name`, of `count` parts (None: any)."""
         limits = lane.limits
         path = str(source.absolute()) if isinstance(source, Path) else None
         request = {
@@ -200,9 +202,9 @@ class Decoder:
             deadline = time.monotonic() + limits.wall_s + GRACE_S
             connection.settimeout(limits.wall_s + GRACE_S)
             try:
-                with suppress(ConnectionError):  # it has ended, and says so below
+                with suppress(ConnectionError):  # it has ended: reported below
                     framing.send(connection, request, [source] if isinstance(source, bytes) else [])
-                head, parts = framing.receive(connection, limits.answer, deadline)
+                head, parts = framing.receive(connection, limits.response, deadline)
                 right = count is None or len(parts) == count
             except TimeoutError:
                 raise Undecodable(f"{name}: {limits.exceeded('clock')}: it is not read") from None
@@ -217,7 +219,7 @@ class Decoder:
             gone = kind == "FileNotFoundError"
             raise FileNotFoundError(text) if gone else Undecodable(text, kind)
         if not right:
-            raise Undecodable(f"{name}: the decoder answered with {len(parts)} parts")
+            raise Undecodable(f"{name}: the decoder returned {len(parts)} parts, expected {count}")
         return head, parts
 
     @contextmanager
@@ -226,20 +228,20 @@ class Decoder:
         ours, theirs = socket.socketpair()
         with ours:
             with theirs, self._lock:
-                for attempt in (1, 2):  # the process may have been killed meanwhile
+                for attempt in (1, 2):  # it may have been killed meanwhile
                     try:
                         socket.send_fds(self._running(), [b"file"], [theirs.fileno()])
                         break
                     except OSError as error:
                         self._end()
                         if attempt == 2:
-                            raise DecoderBusy(f"there is no decoder: {error}") from error
+                            raise DecoderBusy(f"the decoder cannot be started: {error}") from error
             yield ours
 
     def _running(self) -> socket.socket:
-        """The way to the process, which is started where there is none. Holds the lock."""
+        """The socket of the process, which is started if necessary. Call with the lock held."""
         if self._closed:
-            raise DecoderBusy("the service is being stopped: nothing is decoded any more")
+            raise DecoderBusy("the service is stopping")
         if self._control is not None:
             return self._control
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -266,7 +268,7 @@ class Decoder:
         process, self._process = self._process, None
         control, self._control = self._control, None
         if control is not None:
-            control.close()  # the process ends with it, and with the process its forks
+            control.close()  # ends the process and its forks
         if process is not None:
             try:
                 process.wait(END_S)
@@ -286,21 +288,20 @@ def _arrays(
     parts: list[bytearray],
     expected: Sequence[tuple[str, tuple[int | None, ...]]],
 ) -> list[NDArray[Any]]:
-    """The arrays of an answer, where each is of the type and shape (None: any length) that is
-    expected."""
+    """The arrays of a response, checked for the expected types and shapes (None: any length)."""
     found = []
     with suppress(ValueError, KeyError, TypeError):
-        for told, part, (dtype, shape) in zip(head["arrays"], parts, expected, strict=True):
-            size = tuple(told["shape"])
+        for described, part, (dtype, shape) in zip(head["arrays"], parts, expected, strict=True):
+            size = tuple(described["shape"])
             fits = len(size) == len(shape) and all(
                 isinstance(n, int) and n >= 0 and wanted in (None, n)
                 for n, wanted in zip(size, shape, strict=True)
             )
-            if not fits or told["dtype"] != dtype:
+            if not fits or described["dtype"] != dtype:
                 break
             if math.prod(size) * np.dtype(dtype).itemsize != len(part):
                 break
             found.append(np.frombuffer(part, dtype).reshape(size))
         else:
             return found
-    raise Undecodable(f"{name}: the decoder answered with something else than arrays")
+    raise Undecodable(f"{name}: the decoder returned no valid arrays")

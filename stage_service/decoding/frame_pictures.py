@@ -1,4 +1,4 @@
-"""Frames as pictures for people."""
+"""Previews and exposure figures of frames."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from reconstruction.arrays import Bools, Floats
 from reconstruction.images.srgb import srgb
 
 MARK = (1.0, 0.0, 1.0)
-"""A colour that hair does not have."""
+"""Colour of saturated pixels."""
 BINS = 64
 _ROWS = 256
-"""Of a picture that are converted at once: whole ones would take several times their memory."""
+"""Rows converted at a time, to save memory."""
 Attributes = Mapping[str, float | str]
 
 
@@ -28,10 +28,10 @@ def png_of_frame(
     size: int | None = None,
     mark: bool = False,
 ) -> bytes:
-    """A PNG of a frame `(H, W, 3)`: exposed so that `percentile` of its values, or `white`, reach
-    white; sRGB curve, at most `size` pixels on its longer side. `mark` paints what is saturated.
+    """A PNG preview of a frame `(H, W, 3)`: `percentile` of its values, or `white`, becomes white;
+    sRGB, at most `size` pixels on the longer side. `mark` marks saturated pixels.
 
-    Clipped and 8 bits a channel: to look at, never to measure. The image is used up.
+    Overwrites the image.
     """
     full = _saturated(image, attributes) if mark else None
     longest, shown = max(image.shape[:2]), image
@@ -42,7 +42,7 @@ def png_of_frame(
             shares = full.astype(np.float32)
             full = cv2.resize(shares, (width, height), interpolation=cv2.INTER_AREA) > 0
     if white is None:
-        # in place where the picture itself is not needed any more
+        # in place if the image is not needed any more
         white = float(np.percentile(image, percentile, overwrite_input=shown is not image))
     out = np.empty(shown.shape, np.uint8)
     for first in range(0, len(shown), _ROWS):
@@ -58,7 +58,7 @@ def png_of_frame(
 
 
 def frame_figures(image: Floats, attributes: Attributes) -> dict[str, Any]:
-    """How a frame `(H, W, 3)` is exposed: the fields of `FrameFigures`."""
+    """Exposure and sharpness of a frame `(H, W, 3)`: the fields of `FrameFigures`."""
     full_scale = attributes.get("fullScale")
     largest = float(image.max())
     top = float(full_scale) if full_scale is not None else largest
@@ -78,6 +78,6 @@ def frame_figures(image: Floats, attributes: Attributes) -> dict[str, Any]:
 
 
 def _saturated(image: Floats, attributes: Attributes) -> Bools:
-    """Pixels `(H, W)` of which a channel is at full scale."""
+    """Pixels `(H, W)` with a channel at full scale."""
     full_scale = float(attributes.get("fullScale", np.inf))
     return np.asarray((image >= full_scale * (1 - 1e-5)).any(axis=-1))

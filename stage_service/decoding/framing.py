@@ -1,6 +1,6 @@
 """Messages between the service and its decoder: a JSON object, then parts of bytes.
 
-No pickle: a process that a hostile file has taken over must not run code in the one that asked it.
+No pickle: a process compromised by a hostile file must not run code in the service.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 Part = bytes | bytearray | memoryview
 _LENGTH = struct.Struct(">I")
 MOST_TEXT = 4 << 20
-"""Bytes of the JSON object: a board has at most 4,096 squares, each corner some 60 bytes."""
+"""Bytes of the JSON object: a board has at most 4,096 squares of about 60 bytes."""
 
 
 def send(connection: socket.socket, head: dict[str, Any], parts: Sequence[Part] = ()) -> None:
@@ -31,8 +31,8 @@ def receive(
 ) -> tuple[dict[str, Any], list[bytearray]]:
     """The next message, its parts of at most `most` bytes together, until `deadline` (monotonic).
 
-    Raises `TimeoutError`, `EOFError` where the other end has gone, and `ValueError` for what is no
-    message or too large.
+    Raises `TimeoutError`, `EOFError` if the other end has closed, and `ValueError` for an invalid
+    or too large message.
     """
     (length,) = _LENGTH.unpack(_exactly(connection, _LENGTH.size, deadline))
     if length > MOST_TEXT:

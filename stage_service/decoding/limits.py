@@ -1,33 +1,32 @@
-"""What decoding may take: pixels, triangles, memory, seconds."""
+"""Limits of decoding: pixels, triangles, memory, seconds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 MOST_MAP_PIXELS = 4096 * 2048
-"""Of an environment map from a request: 331 lights tell apart far less; larger ones are scaled down
-before they are uploaded."""
+"""Pixels of an uploaded environment map, far above the resolution of 331 lights."""
 MOST_FRAME_PIXELS = 160_000_000
-"""Of a frame that is shown: the largest area sensors have 151 million."""
+"""Pixels of a frame; the largest sensors have 151 million."""
 MOST_CHANNELS = 16
-"""Of an OpenEXR file: all are unpacked, whichever are needed."""
+"""Channels of an OpenEXR file, which are all unpacked."""
 MOST_TRIANGLES = 1_000_000
-"""Of a head: some 0.7 mm from vertex to vertex all over it."""
+"""Triangles of a head, about 0.7 mm each."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one file's decoding: bytes of `memory` beyond what the process begins with, seconds of
-    processor time and by the clock, bytes of the answer."""
+    """Limits of decoding one file: bytes of additional `memory`, seconds of processor time and wall
+    time, bytes of the response."""
 
     memory: int
     cpu_s: int = 30
     wall_s: float = 60.0
-    """Twice the processor's and more: the process has the lowest priority on a busy machine."""
-    answer: int = 512 << 20
+    """Twice the processor time, because the process has a low priority."""
+    response: int = 512 << 20
 
     def exceeded(self, what: str) -> str:
-        """Which limit that is, as a sentence's end: "memory", "processor" or "clock"."""
+        """Text for an exceeded limit: "memory", "processor" or "clock"."""
         return {
             "memory": f"needs more than {self.memory / 2**30:g} GiB of memory",
             "processor": f"takes more than {self.cpu_s} s of processor time",
@@ -36,6 +35,6 @@ class Limits:
 
 
 GIVEN = Limits(2 << 30)
-"""For what a request brings: a map of `MOST_MAP_PIXELS` takes 1.3 GiB."""
+"""For files of requests: a map of `MOST_MAP_PIXELS` takes 1.3 GiB."""
 FRAMES = Limits(6 << 30)
 """For the frames of captures: one of `MOST_FRAME_PIXELS` takes 4.5 GiB."""

@@ -1,7 +1,4 @@
-"""What is decoded, and how: each operation takes a file and gives JSON and bytes.
-
-Run in the decoder's process alone.
-"""
+"""Operations of the decoder's process: each takes a file and returns JSON and bytes."""
 
 from __future__ import annotations
 
@@ -28,49 +25,49 @@ from stage_service.decoding.limits import (
     MOST_TRIANGLES,
 )
 
-Answer = tuple[dict[str, Any], list[Part]]
+Response = tuple[dict[str, Any], list[Part]]
 _RADIANCE_SIZE = re.compile(rb"\n\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n")
 _RADIANCE_HEADER = 1 << 16
-"""Bytes in which a Radiance file's sizes are looked for."""
+"""Leading bytes of a Radiance file in which its size is searched."""
 
 
 def preload() -> None:
-    """Load what forks need, but for the renderer: only maps need that, and it starts threads."""
+    """Load libraries for the forks, without the renderer, which starts threads."""
     from stage_service.decoding import board_views  # noqa: F401
 
     cv2.setNumThreads(1)
 
 
-def preview(file: Path, **look: Any) -> Answer:
+def preview(file: Path, **look: Any) -> Response:
     """A PNG of a frame."""
     _check_exr(file, MOST_FRAME_PIXELS)
     return {}, [png_of_frame(*read_exr(file), **look)]
 
 
-def figures(file: Path) -> Answer:
-    """How a frame is exposed."""
+def figures(file: Path) -> Response:
+    """Exposure and sharpness of a frame."""
     _check_exr(file, MOST_FRAME_PIXELS)
     return {"figures": frame_figures(*read_exr(file))}, []
 
 
-def head(file: Path) -> Answer:
-    """The triangles of an OBJ: vertices, faces, and which of them are scalp, where it says so."""
+def head(file: Path) -> Response:
+    """The triangles of an OBJ: vertices, faces, and the scalp's faces if marked."""
     _check_obj(file, MOST_TRIANGLES)
     mesh = read_obj(file, MOST_TRIANGLES)
     arrays = [mesh.vertices, mesh.faces]
     return _arrays(*arrays, *([] if mesh.scalp is None else [mesh.scalp]))
 
 
-def mask(file: Path, width: int, height: int) -> Answer:
-    """Where a grey PNG of that size is half grey and above."""
+def mask(file: Path, width: int, height: int) -> Response:
+    """Pixels of a grey PNG of that size from half grey on."""
     return _arrays(read_mask(file, width, height))
 
 
 def map_weights(
     file: Path, kind: str, rotation_deg: float, positions: list[Any], intensities: list[Any]
-) -> Answer:
-    """What each light is multiplied by to stand for an environment map of the `kind` "hdr" or
-    "exr"; lights are at `positions (L, 3)` and send `intensities (L, 3)` to the origin."""
+) -> Response:
+    """Weights of lights that represent an environment map of the `kind` "hdr" or "exr"; lights are
+    at `positions (L, 3)` with `intensities (L, 3)` towards the origin."""
     if kind == "exr":
         _check_exr(file, MOST_MAP_PIXELS)
     else:
@@ -88,38 +85,38 @@ def map_weights(
     return _arrays(weights_of_environment(lights, image, rotation_deg))
 
 
-def board(file: Path, **asked: Any) -> Answer:
-    """What a camera's lit frame in the capture at `file` shows of a board."""
+def board(file: Path, **options: Any) -> Response:
+    """The board in a camera's lit frame of the capture at `file`."""
     from stage_service.decoding.board_views import board_view
 
-    return {"board": board_view(file, **asked)}, []
+    return {"board": board_view(file, **options)}, []
 
 
-OPERATIONS: dict[str, Callable[..., Answer]] = {
+OPERATIONS: dict[str, Callable[..., Response]] = {
     f.__name__: f for f in (preview, figures, head, mask, map_weights, board)
 }
 
 
-def _arrays(*arrays: NDArray[Any]) -> Answer:
+def _arrays(*arrays: NDArray[Any]) -> Response:
     whole = [np.ascontiguousarray(a) for a in arrays]
-    told = [{"dtype": a.dtype.str, "shape": a.shape} for a in whole]
-    return {"arrays": told}, [memoryview(a).cast("B") if a.size else b"" for a in whole]
+    described = [{"dtype": a.dtype.str, "shape": a.shape} for a in whole]
+    return {"arrays": described}, [memoryview(a).cast("B") if a.size else b"" for a in whole]
 
 
 def _check_exr(file: Path, most: int) -> None:
-    """Raise `ValueError` where an OpenEXR file unpacks to more than `most` pixels."""
+    """Raise `ValueError` if an OpenEXR file unpacks to more than `most` pixels."""
     plain_file(file)
     try:
         parts = OpenEXR.File(str(file), header_only=True).parts
         sizes = [_size(part.header) for part in parts]
-    except Exception as error:  # the binding raises what it likes
+    except Exception as error:  # the binding raises various classes
         raise ValueError(f"{file}: cannot be read as OpenEXR ({error})") from error
     for width, height, channels in sizes:
         _check_size(file, width, height, most)
         if channels > MOST_CHANNELS:
             raise ValueError(f"{file}: {channels} channels; at most {MOST_CHANNELS} are read")
     if len(sizes) > 1:
-        raise ValueError(f"{file}: {len(sizes)} parts; write the picture alone")
+        raise ValueError(f"{file}: {len(sizes)} parts; expected one image")
 
 
 def _size(header: dict[str, Any]) -> tuple[int, int, int]:
@@ -133,13 +130,13 @@ def _check_radiance(file: Path, most: int) -> None:
     with plain_file(file).open("rb") as opened:
         found = _RADIANCE_SIZE.search(opened.read(_RADIANCE_HEADER))
     if found is None:
-        raise ValueError(f"{file}: cannot be read as a Radiance .hdr image: it has no size")
+        raise ValueError(f"{file}: not a Radiance .hdr image: it has no size")
     first, second = (int(n) for n in found.groups())
     _check_size(file, second, first, most)
 
 
 def _check_obj(file: Path, most: int) -> None:
-    """Raise `ValueError` where an OBJ file has more than `most` faces."""
+    """Raise `ValueError` if an OBJ file has more than `most` faces."""
     faces, last = 0, b"\n"
     with plain_file(file).open("rb") as opened:
         while chunk := opened.read(1 << 20):
@@ -155,5 +152,5 @@ def _check_size(file: Path, width: int, height: int, most: int) -> None:
     """Raise `ValueError` for more than `most` pixels."""
     if width < 1 or height < 1 or width * height > most:
         raise ValueError(
-            f"{file}: the picture unpacks to {width} × {height} pixels; at most {most:,} are read"
+            f"{file}: the image unpacks to {width} × {height} pixels; at most {most:,} are read"
         )

@@ -1,7 +1,7 @@
-"""The decoder's process: forks itself for each file, and stays small and clean.
+"""The decoder's process, which forks for each file.
 
-Each fork begins with the libraries loaded, decodes one file under hard limits, and ends: no file
-finds what another left, and all memory is given back.
+Each fork has the libraries loaded, decodes one file under hard limits, and ends, so files share no
+state and all memory is freed.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from stage_service.decoding import framing
 from stage_service.decoding.operations import OPERATIONS, preload
 
 LOWER = 10
-"""How much lower than the service's the priority is: lamps and frames come first."""
+"""Added to the niceness of the service: lamps and frames come first."""
 MOST_REQUEST = 64 << 20
-"""Bytes of a file that a request brings: twice what the service takes."""
+"""Bytes of a file of a request: twice the service's limit."""
 REQUEST_S = 60
-"""Until the request is read: afterwards its own limits hold."""
+"""Deadline for reading the request; then its own limits apply."""
 NO_NEW_PRIVILEGES, SIGNAL_AT_PARENTS_DEATH = 38, 1  # linux/prctl.h
 NO_MEMORY = re.compile(
     "bad_alloc|[Uu]nable to allocate|[Ff]ailed to allocate|Insufficient memory|file has 0 parts"
 )
-"""What libraries make of it, and readers of that; the last is OpenEXR's, of a file that had one."""
+"""Messages of libraries without memory; the last is OpenEXR's."""
 MEMORY_FILE, MOST_ERROR = re.compile(r"/proc/self/fd/\d+"), 1000
 ENDED_BY = {signal.SIGXCPU: "processor", signal.SIGKILL: "memory", signal.SIGALRM: "clock"}
-"""Which limit it was, by the signal that ended a fork: SIGKILL where the machine has no memory."""
+"""Limit by the signal that ended a fork; SIGKILL: the machine has no memory."""
 
 
 def main(control: socket.socket) -> None:
-    """Decode whatever comes over connections that come through `control`, until that is closed."""
+    """Serve connections that arrive through `control`, until it is closed."""
     os.nice(LOWER)
-    with suppress(OSError):  # when memory runs out, this goes first
+    with suppress(OSError):  # without memory the kernel ends this process first
         Path("/proc/self/oom_score_adj").write_text("1000")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _prctl(NO_NEW_PRIVILEGES, 1)
@@ -70,7 +70,7 @@ def main(control: socket.socket) -> None:
                     _begin(socket.socket(fileno=fd), control, children)
     for pid in children:
         os.kill(pid, signal.SIGKILL)
-    os._exit(0)  # at once: whoever closes it waits
+    os._exit(0)  # at once: the parent waits for it
 
 
 def _begin(connection: socket.socket, control: socket.socket, children: dict[int, Any]) -> None:
@@ -78,18 +78,18 @@ def _begin(connection: socket.socket, control: socket.socket, children: dict[int
     try:
         pid = os.fork()
     except OSError as error:  # no process, no memory
-        _tell(connection, {"ended": f"no process: {error}"})
+        _send(connection, {"ended": f"no process: {error}"})
         connection.close()
         return
     if pid:
-        children[pid] = connection  # kept, to say there how the fork ended
+        children[pid] = connection  # to report how the fork ended
         return
     status = 1
     try:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         _prctl(SIGNAL_AT_PARENTS_DEATH, signal.SIGKILL)
-        if os.getppid() != parent:  # it has died already
+        if os.getppid() != parent:  # the parent has died already
             return
         control.close()
         for other in children.values():
@@ -112,37 +112,37 @@ def _reap(children: dict[int, socket.socket]) -> None:
             number = os.WTERMSIG(status)
             limit = ENDED_BY.get(signal.Signals(number))
             name = signal.Signals(number).name
-            _tell(connection, {"limit": limit} if limit else {"ended": name})
+            _send(connection, {"limit": limit} if limit else {"ended": name})
         elif status:
             code = os.waitstatus_to_exitcode(status)
-            _tell(connection, {"ended": f"exit code {code}"})
+            _send(connection, {"ended": f"exit code {code}"})
         connection.close()
 
 
-def _tell(connection: socket.socket, head: dict[str, Any]) -> None:
-    """Say so, where anybody still listens; never wait for who does not."""
+def _send(connection: socket.socket, head: dict[str, Any]) -> None:
+    """Send a message without waiting, if the other end is still open."""
     connection.setblocking(False)
     with suppress(OSError):
         framing.send(connection, head)
 
 
 def _decode(connection: socket.socket) -> None:
-    """In the fork: read the request, answer it."""
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends it, whatever a library is at
+    """In the fork: read the request and send the response."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends the fork even inside a library
     signal.alarm(REQUEST_S)
     request, parts = framing.receive(connection, MOST_REQUEST)
     _limit(*request["limits"])
     name, path = request["name"], request["path"]
     try:
         with _at_hand(path, parts) as file:
-            head, answer = OPERATIONS[request["operation"]](file, **request["options"])
+            head, data = OPERATIONS[request["operation"]](file, **request["options"])
     except Exception as error:
-        head, answer = _wrong(error, path, name), []
-    framing.send(connection, head, answer)
+        head, data = _error(error, path, name), []
+    framing.send(connection, head, data)
 
 
-def _wrong(error: Exception, path: str | None, name: str) -> dict[str, Any]:
-    """What an answer says of an error; the file has the name that whoever asked has for it."""
+def _error(error: Exception, path: str | None, name: str) -> dict[str, Any]:
+    """The response for an error, with the client's name of the file."""
     if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
         return {"limit": "memory"}
     kind, text = type(error).__name__, str(error)
@@ -154,7 +154,7 @@ def _wrong(error: Exception, path: str | None, name: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _at_hand(path: str | None, parts: list[bytearray]) -> Any:
-    """The file that is asked for; what came with the request as one in memory."""
+    """The requested file; data of the request as a file in memory."""
     if path is not None:
         yield Path(path)
         return

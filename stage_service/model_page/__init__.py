@@ -1,7 +1,7 @@
-"""`index.html` of a model: what is there, which of it is the result, how good, what was left out.
+"""`index.html` of a model: results, scores, warnings, figures, files.
 
-The page is read from disk or from the service: it runs no script and asks for nothing but the
-pictures beside it.
+The page is read from disk or from the service; it has no scripts and loads only images of its
+folder.
 """
 
 from stage_service.model_page.page import model_page, write_page

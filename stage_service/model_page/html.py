@@ -1,4 +1,4 @@
-"""HTML as values: whatever is not `Html` already is escaped when it goes into an element."""
+"""HTML as values: text that is not `Html` is escaped."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ SPREAD = ("p10", "p50", "p90")
 
 
 class Html(str):
-    """Text that is markup and may go into a page as it is."""
+    """Text that is markup and is not escaped."""
 
     __slots__ = ()
 
 
 def element(name: str, /, *content: str, **attributes: object) -> Html:
-    """`<name attributes>content</name>`; a trailing or inner `_` of an attribute is left out or -.
-
-    Attributes of value None are left out.
-    """
+    """`<name attributes>content</name>`; in attribute names a trailing `_` is dropped, others
+    become `-`; attributes of value None are skipped."""
     given = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{escape(str(value))}"'
         for key, value in attributes.items()
@@ -34,17 +32,17 @@ def element(name: str, /, *content: str, **attributes: object) -> Html:
 
 
 def joined(content: Iterable[str]) -> Html:
-    """Pieces one after the other, escaped where they are plain text."""
+    """Concatenated pieces, escaped if plain text."""
     return Html("".join(c if isinstance(c, Html) else escape(c) for c in content))
 
 
 def heading(text: str) -> Html:
-    """The cell above a column; over one without a name it is no heading."""
+    """A column's heading, or an empty cell."""
     return element("th", text, scope="col") if text else element("td")
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> Html:
-    """A table that scrolls by itself where it is too wide; nothing where it has no rows."""
+    """A table that scrolls if it is too wide; empty without rows."""
     body = [element("tr", *(element("td", cell) for cell in row)) for row in rows]
     if not body:
         return Html("")
@@ -55,12 +53,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -
 
 
 def link(path: str, *content: str, class_: str | None = None) -> Html:
-    """A link to a file of the folder that the page lies in."""
+    """A link to a file of the page's folder."""
     return element("a", *(content or (path,)), href=quote(path), class_=class_)
 
 
 def number(value: object) -> str:
-    """A figure as people read it: four digits are enough."""
+    """A figure with four digits."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -73,16 +71,16 @@ def number(value: object) -> str:
         digits, _, power = f"{value:.3e}".partition("e")
         times = "" if float(digits) == 1 else f"{float(digits):g} · "
         return f"{times}10{_raised(int(power))}"
-    return "not known" if value is None else str(value)
+    return "unknown" if value is None else str(value)
 
 
 def words(name: str) -> str:
-    """A field's name as a phrase."""
+    """A field's name in words."""
     return name.replace("_", " ")
 
 
 def seconds(value: float) -> str:
-    """A time as people say it."""
+    """A duration as text."""
     if value >= 5400:
         return f"{int(value // 3600)} h {int(value % 3600 // 60)} min"
     if value >= 120:
@@ -91,15 +89,15 @@ def seconds(value: float) -> str:
 
 
 def size(count: int) -> str:
-    """Bytes as people say them."""
+    """A number of bytes as text."""
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= 0.9995 * scale:  # 999,999 are no 1e+03 kB
+        if count >= 0.9995 * scale:  # 999,999 B is 1 MB
             return f"{count / scale:.3g} {unit}"
     return f"{count} B"
 
 
 def flat(figures: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Figures of any depth as rows (name, value): a spread and a list of a few are one value."""
+    """Nested figures as rows (name, value); spreads and short lists are one value."""
     for key, value in figures.items():
         name = f"{above} · {words(str(key))}" if above else words(str(key))
         if isinstance(value, Mapping) and set(SPREAD) <= set(value):

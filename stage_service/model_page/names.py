@@ -37,12 +37,12 @@ PICTURES = {
 
 
 def threshold(name: str) -> str:
-    """`1mm_10deg` as in print."""
+    """`1mm_10deg` as text."""
     return name.replace("mm_", " mm/").replace("deg", "°")
 
 
 def strand_figure(scores: Mapping[str, Any], place: Sequence[str]) -> float | None:
-    """The figure at `place` of what `compare_strands` returns; None where there is none."""
+    """The figure at `place` in the result of `compare_strands`; None if missing."""
     found: Any = scores
     for key in place:
         found = found.get(key, {})
@@ -52,7 +52,7 @@ def strand_figure(scores: Mapping[str, Any], place: Sequence[str]) -> float | No
 def strand_cells(
     scores: Mapping[str, Any], places: Sequence[Sequence[str]] | None = None
 ) -> list[str]:
-    """The `STRAND_FIGURES` in print, or those at `places`; a dash where there is none."""
+    """The `STRAND_FIGURES`, or those at `places`, as text; a dash if missing."""
     values = [
         strand_figure(scores, place) for place in places or [place for *_, place in STRAND_FIGURES]
     ]

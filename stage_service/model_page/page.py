@@ -1,4 +1,4 @@
-"""The page's parts, top to bottom."""
+"""The page's parts from top to bottom."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ from stage_service.model_page.plots import error_plots, time_bars
 
 PAGE, FIELD_FILE = "index.html", "field.npz"
 HERO = ("relit.png", "render.png", "comparison.png")
-"""The picture at the top: the first that is there."""
+"""The image at the top: the first that exists."""
 SHOWN = {
-    "relit.png": "The result under an environment map that no camera saw.",
-    "relit.webp": "The same while the environment turns round.",
-    "comparison.png": "Frames that no fit has seen: captured, rendered, and the baselines.",
+    "relit.png": "The result under a new environment map.",
+    "relit.webp": "The same under the turning environment.",
+    "comparison.png": "Held-out frames: captured, rendered, and baselines.",
     "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
-    "render.png": "What hairstage render drew last.",
-    "plots/geometry.png": "Strands against the true ones, beside baselines and true directions.",
+    "render.png": "The latest image of hairstage render.",
+    "plots/geometry.png": "Strands, baselines and true directions against the true strands.",
 }
 
 
 def write_page(model: Model) -> Path:
-    """Write `index.html` of what `model` holds now; returns its path."""
+    """Write the `index.html` of `model`; returns its path."""
     with model.writing(PAGE) as part:
         part.write_text(model_page(model), encoding="utf-8")
     return model.file(PAGE)
 
 
 def model_page(model: Model) -> Html:
-    """The page of `model` as it is now; a folder without strands has one too."""
+    """The page of `model`, with or without strands."""
     report = model.report()
     results = model.json("results.json") if model.has("results.json") else {}
     name = model.path.resolve().name
@@ -63,11 +63,11 @@ def model_page(model: Model) -> Html:
     parts = {
         "Result": _result(model),
         f"Warnings ({len(warnings)})": _warnings(report, warnings),
-        "How good it is": _quality(model, results),
+        "Scores": _quality(model, results),
         "Pictures": _pictures(model),
         "Time": _time(report),
-        "Left out": _left_out(report),
-        "Every figure": _figures(report),
+        "Skipped work": _left_out(report),
+        "All figures": _figures(report),
         "Files": _files(model),
     }
     shown = {title: content for title, content in parts.items() if content}
@@ -97,9 +97,9 @@ def model_page(model: Model) -> Html:
 
 
 def _result(model: Model) -> Html:
-    """What to take away: strands and material, with the files that hold them."""
+    """Strands and material, with their files."""
     if not model.has("strands.npz"):
-        return element("p", "There are no strands yet: the reconstruction has not come to its end.")
+        return element("p", "There are no strands yet: the reconstruction has not finished.")
     strands, name = model.strands(), shlex.quote(model.path.resolve().name)
     lengths = strands.lengths()
     facts = [
@@ -117,8 +117,8 @@ def _result(model: Model) -> Html:
         )
         radius = 1e6 * _middle(strands.radius)
         facts.append(("radius", [element("b", f"{radius:.0f} µm"), _coverage_note(radius)]))
-    facts += [*_laid_head(model), *_material(model)]
-    rows = [joined([element("dt", what), element("dd", *said)]) for what, said in facts]
+    facts += [*_fitted_head(model), *_material(model)]
+    rows = [joined([element("dt", what), element("dd", *text)]) for what, text in facts]
     text = joined(
         [
             element(
@@ -127,13 +127,13 @@ def _result(model: Model) -> Html:
                 link("strands.usdc" if model.has("strands.usdc") else "strands.npz"),
                 " with ",
                 *_material_files(model),
-                ". Everything else here says how they came about and how good they are.",
+                ". The other sections have scores, warnings and timings.",
                 class_="lead",
             ),
             element("dl", *rows),
             element(
                 "p",
-                "To turn it under your hand, in a browser: ",
+                "To view it in a browser: ",
                 element("code", f"hairstage view {name}"),
                 ". For other programs: ",
                 element("code", f"hairstage export {name} --to blender --out FOLDER"),
@@ -159,41 +159,43 @@ def _material_files(model: Model) -> list[str]:
 
 
 def _by_inverse_rendering(model: Model) -> bool:
-    """Whether its maps are a fit's; those of an edited model, which has no report, are not."""
+    """Whether its maps are from inverse rendering and not from an edit, which has no report."""
     names = (stage.name for stage in model.report().stages)
     return model.has("hair_maps.npz") and "inverse_rendering" in names
 
 
-def _laid_head(model: Model) -> Iterator[tuple[str, list[str]]]:
-    """Under what a head was laid that nobody measured, and how near it came."""
-    laid = next((s.figures for s in model.report().stages if s.name == "head"), {})
-    if model.has("head.obj") and {"template", "source", "rms_mm"} <= set(laid):
-        where = f": the {laid['template']} laid under {laid['source']}"
-        said = f"{where}, {laid['rms_mm']:.1f} mm off what it was laid under, root mean square"
-        yield "head", [link("head.obj"), said]
+def _fitted_head(model: Model) -> Iterator[tuple[str, list[str]]]:
+    """The source of a fitted head, and the residual of its fit."""
+    fit = next((s.figures for s in model.report().stages if s.name == "head"), {})
+    if model.has("head.obj") and {"template", "source", "rms_mm"} <= set(fit):
+        rms = f"{fit['rms_mm']:.1f} mm rms"
+        yield (
+            "head",
+            [link("head.obj"), f": the {fit['template']} fitted to {fit['source']}, {rms}"],
+        )
 
 
 def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
-    """Roughness and colour of Sun's fit with their errors; which fit is rendered."""
+    """Roughness and colour of Sun's fit with their errors, and the rendered fit."""
     if not model.has("appearance.json"):
         return
     fit = model.json("appearance.json")
     hair, interval, errors = fit["hair"], fit.get("beta_m_interval"), fit.get("sigma_a_error")
     known = errors is not None
-    said: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}"), ", to render these strands with"]
+    text: list[str] = [element("b", f"β_M {hair['beta_m']:.2f}"), ", for rendering these strands"]
     if interval:
-        said.append(f"; 95 % interval {interval[0]:.2f} to {interval[1]:.2f}")
-    yield "roughness", said
-    said = [_swatch(fit["colour"]), "σ_a "]
+        text.append(f"; 95 % interval {interval[0]:.2f} to {interval[1]:.2f}")
+    yield "roughness", text
+    text = [_swatch(fit["colour"]), "σ_a "]
     for k, (value, error) in enumerate(zip(hair["sigma_a"], errors or [None] * 3, strict=True)):
-        said += [", " if k else "", element("b", f"{value:.2g}")]
-        said.append("" if error is None else f" ± {error:.0%}")
-    yield "colour", [*said, "" if known else ", no error known"]
+        text += [", " if k else "", element("b", f"{value:.2g}")]
+        text.append("" if error is None else f" ± {error:.0%}")
+    yield "colour", [*text, "" if known else ", error unknown"]
     yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
     if _by_inverse_rendering(model):
-        yield "rendered", ["inverse rendering; the roughness and colour above are its start"]
+        yield "rendered", ["inverse rendering, which started from the roughness and colour above"]
     if model.has(FIELD_FILE):
-        yield "field", [link(FIELD_FILE), ": what the hair reflects beyond that is rendered too"]
+        yield "field", [link(FIELD_FILE), ": reflectance that the material lacks, also rendered"]
 
 
 def _swatch(linear: Sequence[float]) -> Html:
@@ -205,7 +207,7 @@ def _swatch(linear: Sequence[float]) -> Html:
 
 def _coverage_note(radius: float) -> str:
     if radius > 60:
-        return ", thicker than hair (20 to 60 µm), because fewer strands cover the same head"
+        return ", above that of hair (20 to 60 µm), because fewer strands cover the same head"
     return ""
 
 
@@ -218,13 +220,13 @@ def _warnings(report: Report, warnings: Sequence[tuple[str, str]]) -> Html:
     if not report.stages:
         return Html("")
     if not warnings:
-        return element("p", "No stage warned of anything.")
+        return element("p", "No stage reported a warning.")
     rows = [element("li", element("b", words(stage)), " ", text) for stage, text in warnings]
     return element("ul", *rows, class_="warnings")
 
 
 def _quality(model: Model, results: Mapping[str, Any]) -> Html:
-    """Against truth, baselines and held-out frames, where there are any."""
+    """Scores against truth, baselines and held-out frames, if there are any."""
     parts = []
     if "geometry" in results:
         found = {"ours": results["geometry"], **results.get("baselines", {})}
@@ -234,7 +236,7 @@ def _quality(model: Model, results: Mapping[str, Any]) -> Html:
         ]
     if any(group in results.get("images", {}) for group in GROUPS):
         parts += [
-            element("h3", "Pictures: PSNR, SSIM and relative error on the hair"),
+            element("h3", "Images: PSNR, SSIM and relative error on the hair"),
             _picture_table(results["images"]),
             element("p", "Means over the images of each group.", class_="quiet"),
         ]
@@ -275,8 +277,8 @@ def _strand_table(found: Mapping[str, Any]) -> Html:
     heads = [title for title, *_ in STRAND_FIGURES]
     whole = table(["", *heads], [*rows, ["the truth", *truth]], "figures")
     note = (
-        "Many strands side by side buy recall: at equal length the prediction is cut at random, "
-        "whole strands, to the true metres."
+        "More strands raise recall: at equal length a random subset of the predicted strands has "
+        "the true total length."
     )
     return joined([scored, whole, element("p", note, class_="quiet")])
 
@@ -301,8 +303,8 @@ def _appearance_table(fits: Mapping[str, Mapping[str, Any]]) -> Html:
     names = {key: None for figures in fits.values() for key in figures}
     rows = []
     for key in names:
-        said = _shares if key.endswith("_error") else _numbers
-        cells = (said(figures[key]) if key in figures else "–" for figures in fits.values())
+        show = _shares if key.endswith("_error") else _numbers
+        cells = (show(figures[key]) if key in figures else "–" for figures in fits.values())
         rows.append([words(key), *cells])
     return table(["", *(PICTURES.get(n, words(n)) for n in fits)], rows, "figures")
 
@@ -313,9 +315,9 @@ def _ours(name: str, titles: Mapping[str, str]) -> str:
 
 
 def _shares(value: Any) -> str:
-    """Errors of logarithms."""
+    """Standard errors of logarithms, in per cent."""
     values = value if isinstance(value, list) else [value]
-    return ", ".join("not known" if x is None else f"± {x:.1%}" for x in values)
+    return ", ".join("unknown" if x is None else f"± {x:.1%}" for x in values)
 
 
 def _numbers(value: Any) -> str:
@@ -343,7 +345,7 @@ def _time(report: Report) -> Html:
     plots = [plot for stage in report.stages for plot in error_plots(stage)]
     return joined(
         [
-            element("p", f"{time_text(total)} in the stages of this model, by the clock."),
+            element("p", f"{time_text(total)} wall time in the stages of this model."),
             time_bars(report.stages),
             element("div", *plots, class_="plots") if plots else "",
         ]
@@ -356,8 +358,8 @@ def _left_out(report: Report) -> Html:
         for stage in report.stages
         for item in stage.left_out
     ]
-    intro = "Work that was not done because this subject did not need it, and what that saved."
-    ledger = table(["stage", "left out", "why", "saved"], rows)
+    intro = "Work that this subject did not need, and its saving."
+    ledger = table(["stage", "skipped", "reason", "saved"], rows)
     return joined([element("p", intro), ledger]) if rows else Html("")
 
 
@@ -375,7 +377,7 @@ def _figures(report: Report) -> Html:
 
 
 def _files(model: Model) -> Html:
-    """Every file by the name under which `FILES` knows it; those of folders one by one."""
+    """All files with the description of `FILES`, folders expanded."""
     found = model.sizes()
     found.pop(PAGE, None)
     rows: list[list[str]] = []

@@ -1,1 +1,1 @@
-"""The console: pages for the people at a stage, who steer it by the API as everybody does."""
+"""The operator's console: web pages that use the HTTP API."""

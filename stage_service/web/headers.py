@@ -1,8 +1,8 @@
-"""The headers that limit what a browser does with an answer: one table of policies.
+"""Security headers of responses: one table of policies.
 
-`SafeHeaders` puts `INERT` on every answer that names no other policy, so that a new route is safe
-without a line of its own. Files that others may have written (models, captures) must not act on
-the service's origin: a script there could send requests with the cookie of whoever opened it.
+`SafeHeaders` adds `INERT` to every response without a policy, so new routes are safe by default.
+Untrusted files (models, captures) must not act on the service's origin, where a script could send
+requests with the reader's cookie.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 Policy = Mapping[str, str]
 REVALIDATED = "no-cache"
-"""A browser may keep it, and asks each time whether it has changed: for files of the product."""
+"""The browser may cache it and revalidates each time: for files of the product."""
 _EVERYWHERE = {
     "cross-origin-resource-policy": "same-origin",
     "referrer-policy": "no-referrer",
@@ -28,11 +28,11 @@ _NOTHING = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ances
 INERT: Policy = {
     **_EVERYWHERE,
     "cache-control": "private, no-store",
-    # the style is that of a browser's own view of a picture or of JSON
+    # browsers style their own view of images and JSON
     "content-security-policy": f"sandbox; {_NOTHING}; style-src 'unsafe-inline'",
 }
-"""For whatever shows or describes a person or the stage: no browser keeps it; opened by itself it
-runs no script, sends no form, has no origin, and is in no frame."""
+"""For data of persons or the stage: not cached; opened as a page it has no scripts, forms, origin
+or frames."""
 
 PAGE: Policy = {
     **_EVERYWHERE,
@@ -43,27 +43,27 @@ PAGE: Policy = {
     ),
     "cross-origin-opener-policy": "same-origin",
 }
-"""For the product's own pages, their scripts and styles: nothing inline, nothing from another host,
-no page of another host has them in a frame or a handle of their window."""
+"""For the product's own pages, scripts and styles: nothing inline or from other hosts, no access by
+pages of other hosts."""
 
 _BEGINNINGS = {
     "image/jpeg": (b"\xff\xd8\xff", 0),
     "image/png": (b"\x89PNG\r\n\x1a\n", 0),
     "image/webp": (b"WEBP", 8),
 }
-"""Pictures that are shown in the browser, by the bytes that each has and where."""
+"""Images that the browser may show, by their signature and its offset."""
 _PICTURES = {".jpg": "image/jpeg", ".png": "image/png", ".webp": "image/webp"}
 OTHER = "application/octet-stream"
 
 
 def report_policy(host: str, folder: str) -> Policy:
-    """The policy of a model's own page: it shows the pictures of its `folder` (a path on this
-    service, escaped, with a slash at its end), and its links download the files beside it.
+    """The policy of a model's page: it may show images of its `folder` (an escaped path on this
+    service that ends with a slash) and download files.
 
-    `host` is the request's. The page keeps the service's origin, or its pictures would come
-    without the login; without scripts, forms and frames it can do nothing with it.
+    `host` is the request's. The page keeps the service's origin, so that its images are loaded with
+    the login; it has no scripts, forms or frames.
     """
-    # a policy has no way to write an IPv6 address: there, all pictures of this service
+    # a policy cannot contain an IPv6 address: there, all images of this service
     pictures = "'self'" if "[" in host else host + folder
     limits = f"{_NOTHING}; style-src 'unsafe-inline'; img-src {pictures} data:"
     policy = f"sandbox allow-same-origin allow-downloads; {limits}"
@@ -71,16 +71,15 @@ def report_policy(host: str, folder: str) -> Policy:
 
 
 def attachment(name: str) -> str:
-    """`Content-Disposition` of a file that is saved under this name, never shown."""
+    """`Content-Disposition` of a file that is saved under this name and not shown."""
     plain = "".join(c if c.isascii() and c.isprintable() and c not in '"\\%' else "_" for c in name)
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
 
 
 def presented(file: Path) -> tuple[str, dict[str, str]]:
-    """The media type and the headers of a file that somebody else may have written.
+    """Media type and headers of an untrusted file.
 
-    Shown in the browser are JSON, and pictures that begin as their name says; all else is saved,
-    a file that has just gone, too.
+    The browser shows JSON, and images with the signature of their suffix, and saves other files.
     """
     suffix = file.suffix.lower()
     if suffix == ".json":
@@ -95,10 +94,8 @@ def presented(file: Path) -> tuple[str, dict[str, str]]:
 
 
 class SafeHeaders:
-    """Adds `INERT` to each answer, where its route has not set a header of that name.
-
-    Only an answer under `REVALIDATED` is kept by a browser, whatever else its route says.
-    """
+    """Adds the headers of `INERT` that a route has not set. Only responses under `REVALIDATED` are
+    cached."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,8 +1,4 @@
-"""The console's files. They say nothing of a stage; what they show, they ask of the API.
-
-Plain ES modules: no build step, nothing from elsewhere, nothing on the server for an open page
-but its stream of events.
-"""
+"""The console's static files: ES modules without a build step, which use the API."""
 
 from __future__ import annotations
 
@@ -44,5 +40,5 @@ def docs() -> FileResponse:
 
 @router.get("/favicon.ico")
 def icon() -> FileResponse:
-    """What browsers ask for beside pages that name no icon: a model's, the viewer's."""
+    """The icon of pages that name none."""
     return get_file(PAGES["/favicon.ico"])

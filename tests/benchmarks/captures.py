@@ -63,7 +63,6 @@ class SimulatedCapture:
         command = SimulatedRig(rig, self.subject, self.head, self.seed).command(
             *("--state", folder / "simulated", "--truth", truth, "--ports", "auto"),
             *("--spp", str(self.spp), "--drift-mm", str(self.drift_mm)),
-            *("--cache", cache.resolve() / "lights"),
         )
         with Children(folder / "logs") as children:
             devices = children.ready("simulators", command, 300)["devices"]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import shutil
 
 import numpy as np
 import pytest
 
-from reconstruction.files import durable
-from simulators.frames.frames import FrameMaker, Sensor, Snapshot, renderer_digest
+from simulators.frames.frames import FrameMaker, Sensor, Snapshot
 from simulators.frames.responses import Response
 from simulators.peers.faults import Faults
 from simulators.peers.lamps import Lamps
@@ -148,48 +145,6 @@ def test_responses_are_rendered_once_and_old_poses_go(frames):
         ("sweep", 2),
         ("sweep", 0),
     ]
-
-
-def test_the_cache_is_on_the_disk_before_it_counts(tiny_rig, tmp_path, monkeypatch):
-    def full(path):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(durable, "flush", full)
-    frames = FrameMaker(tiny_rig, Counting(), Sensor(), 0, tmp_path / "cache", "one")
-    with pytest.raises(OSError, match="No space left"):
-        value(frames, shot((0, 1, 0, 0, 0)))
-    assert list((tmp_path / "cache").glob("*.npz")) == []
-
-
-def test_the_cache_on_disk_depends_on_its_key(tiny_rig, tmp_path):
-    def calls(key):
-        frames = FrameMaker(tiny_rig, Counting(), Sensor(), 0, tmp_path / "cache", key)
-        assert value(frames, shot((0, 1, 0, 0, 0))) == 2
-        return frames._responder.calls
-
-    assert calls("a") == ["lamps"]
-    assert calls("a") == []
-    assert calls("b") == ["lamps"]
-
-
-def test_what_an_older_renderer_made_is_not_used_again(tmp_path):
-    """One digit in one file of the renderer, and every key is another."""
-
-    def copied(package):
-        folder = tmp_path / package
-        if not folder.is_dir():
-            shutil.copytree(importlib.import_module(package).__path__[0], folder)
-        return folder
-
-    before = renderer_digest(copied)
-    assert before == renderer_digest()
-    smoothed = tmp_path / "appearance" / "render" / "smoothed.py"
-    text = smoothed.read_text()
-    smoothed.write_text(text.replace("SIGMA = 1.25", "SIGMA = 1.26"))
-    assert smoothed.read_text() != text
-    assert renderer_digest(copied) != before
-    smoothed.write_text(text)
-    assert renderer_digest(copied) == before
 
 
 def test_drift_reaches_what_was_asked_and_starts_at_rest():

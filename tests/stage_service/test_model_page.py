@@ -116,12 +116,12 @@ def test_a_head_that_nobody_measured_is_called_what_it_is(model):
     with report.stage("head") as stage:
         stage.figures = {"template": "generic head", "source": "skin " + EVIL, "rms_mm": 1.24}
     model.write_report(report)
-    said = "head.obj: the generic head laid under skin <img"
+    said = "head.obj: the generic head fitted to skin <img"
     assert said not in Page(model_page(model)).text, "refused: there is no head"
     model.write_head(Mesh(np.eye(3), np.array([[0, 1, 2]])))
     text = Page(model_page(model)).text
     assert said in text
-    assert "1.2 mm off what it was laid under" in text
+    assert "1.2 mm rms" in text
 
 
 def test_names_and_messages_are_text_and_nothing_runs_or_is_fetched(model):
@@ -157,7 +157,7 @@ def test_an_error_of_a_logarithm_is_a_share(model):
     model.write_json("results.json", {**results, "appearance": {"fitted": fitted}})
     text = Page(model_page(model)).text
     assert "beta m error± 6.8%" in text
-    assert "± 2.0%, not known, ± 10.0%" in text
+    assert "± 2.0%, unknown, ± 10.0%" in text
 
 
 def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
@@ -199,7 +199,7 @@ def test_a_page_does_not_outlive_what_it_is_of(model):
     ("value", "text"),
     [
         *((3, "3"), (1234567, "1,234,567"), (0.123456, "0.1235"), (2.5e-7, "2.5 · 10⁻⁷")),
-        *((1e-4, "10⁻⁴"), (True, "yes"), (None, "not known"), (12345.6, "12,346"), (0.0, "0")),
+        *((1e-4, "10⁻⁴"), (True, "yes"), (None, "unknown"), (12345.6, "12,346"), (0.0, "0")),
     ],
 )
 def test_numbers_read_well(value, text):
@@ -209,7 +209,7 @@ def test_numbers_read_well(value, text):
 def test_figures_of_any_depth_become_rows():
     figures = {"a": {"b_c": {"x": 1, "y": None}, "d": [1, 2]}, "e": [{"f": 1}]}
     assert list(flat(figures)) == [
-        ("a · b c", "x 1, y not known"),
+        ("a · b c", "x 1, y unknown"),
         ("a · d", "1, 2"),
         ("e", "1 entries in report.json"),
     ]

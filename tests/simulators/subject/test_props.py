@@ -60,7 +60,7 @@ def test_a_diffuse_sphere_shines_by_lambert_and_inverse_square() -> None:
 def test_rows_of_a_sweep_sum_to_the_beam_on_the_board() -> None:
     prop = board_pose(0, Board())
     sweep = PropResponder(RIG, prop).sweep("front", 0)["beam"]
-    points = prop.see(CAMERA, np.zeros((1, 2)))
+    points = prop.sample(CAMERA, np.zeros((1, 2)))
     row = BEAM.project(points.points[:, 0])[0][:, 1]
     brightest = sweep.images.sum(axis=-1).argmax(axis=0)
     shared = np.isin(sweep.pixels, points.pixels)

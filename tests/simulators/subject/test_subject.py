@@ -100,7 +100,6 @@ def test_the_full_groom_has_a_head_of_hair(name):
 def test_the_seed_decides_every_byte(subjects):
     again, other = (make_subject("wavy", seed, strands=1500) for seed in (3, 4))
     assert again.strands.points.tobytes() == subjects["wavy"].strands.points.tobytes()
-    assert again.digest() == subjects["wavy"].digest() != other.digest()
     assert not np.isin(other.strands.roots[:, 0], again.strands.roots[:, 0]).any()
 
 

@@ -18,7 +18,7 @@ from serving import Client, serving
 from waiting import until
 
 from reconstruction import Model, Strands
-from stage_service.api import bodies, connections, pace, porch
+from stage_service.api import bodies, connections, porch, throttle
 from stage_service.api.gate import Access
 from stage_service.api.places import LIMITS, Kind, NoPlace, Owner, Places
 from stage_service.api.throttle import Throttle, Throttled
@@ -182,7 +182,7 @@ def test_a_place_that_is_given_back_goes_to_who_steers_first(limit):
 
 
 def test_while_a_capture_is_shot_work_of_others_is_done_one_piece_after_the_other(monkeypatch):
-    monkeypatch.setattr(pace, "WAIT_S", 0.01)
+    monkeypatch.setattr(throttle, "WAIT_S", 0.01)
 
     async def run() -> None:
         running = [True]
@@ -192,7 +192,7 @@ def test_while_a_capture_is_shot_work_of_others_is_done_one_piece_after_the_othe
             await found.turn()
         first.end()
         first.end()  # once
-        monkeypatch.setattr(pace, "SHARE", 1e-6)
+        monkeypatch.setattr(throttle, "SHARE", 1e-6)
         # What it took is rested for, a million times as long.
         (await found.turn(patient=True)).end()
         with pytest.raises(Throttled):
@@ -293,8 +293,8 @@ def test_silent_connections_keep_nobody_out(callers, world, monkeypatch):
 
 
 def test_while_a_capture_is_shot_others_wait_and_who_steers_does_not(callers, world, monkeypatch):
-    monkeypatch.setattr(pace, "WAIT_S", 0.2)
-    monkeypatch.setattr(pace, "SHARE", 1e-6)  # after the first, none has a turn
+    monkeypatch.setattr(throttle, "WAIT_S", 0.2)
+    monkeypatch.setattr(throttle, "SHARE", 1e-6)  # after the first, none has a turn
     with shooting(callers, world) as capture:
         assert callers.ask("reader", "GET /rig").status_code in (200, 503)
         for name, what in (
