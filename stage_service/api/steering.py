@@ -127,5 +127,5 @@ async def blackout(
 
 @router.post("/devices/acknowledge", tags=["devices"])
 def acknowledge(body: AcknowledgeRequest, service: OnService, by: Arms) -> dict[str, Any]:
-    """Record that a person has seen the lamps dark, if the link cannot read them back."""
+    """Record a person's observation that the lamps are dark, if the link cannot read them back."""
     return service.acknowledge(body, by)

@@ -22,7 +22,7 @@ ACTION = re.compile(
     r"(?:[:;,.] |\b(?:and|or|until you) )"
     r"(?:add|check|give|import|look at|move|provide|set|shoot|turn|use)\b"
 )
-"""How a warning asks for an action: an imperative that begins a clause."""
+"""An imperative that begins a clause: the warning needs an action."""
 
 
 def last_screen(results: Mapping[str, Any], out: Path) -> str:
@@ -84,11 +84,11 @@ def _row(
 
 
 def _warnings(warnings: list[str]) -> Iterator[str]:
-    """Those that ask for an action, in two lines each, and how many others there are."""
+    """Those that need an action, in two lines each, and the number of others."""
     act = [w for w in warnings if ACTION.search(w)]
     more = len(warnings) - len(act[:MOST_WARNINGS])
     others = f"; {more} more on the model's page" if more else ""
-    yield f"Warnings that ask for an action: {len(act) or 'none'}{others}"
+    yield f"Warnings to act on: {len(act) or 'none'}{others}"
     for text in act[:MOST_WARNINGS]:
         first, *rest = wrap(text, WIDTH, subsequent_indent="    ", max_lines=2, placeholder=" …")
         yield from (f"  {first}", *rest)

@@ -49,7 +49,7 @@ def run_blackout(_args: argparse.Namespace, output: Output, service: ServiceClie
 
 
 def run_acknowledge(args: argparse.Namespace, output: Output, service: ServiceClient) -> None:
-    """Record that a person has seen the lamps dark.
+    """Record a person's observation that the lamps are dark.
 
     Only for light banks that cannot read back; for others a blackout verifies it.
     """

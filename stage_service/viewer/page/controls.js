@@ -1,4 +1,4 @@
-// The panel beside the picture: what is shown, and how.
+// The control panel.
 
 import * as net from "./net.js";
 import { Relight } from "./relight.js";
@@ -78,7 +78,7 @@ export class Controls {
       viewer.orbit.zoom(wires.checked ? 6 : 1 / 6);
       viewer.draw();
     });
-    this.through = choice([["", "none: turn freely"], ...about.cameras.map((c) => [c.name, c.name])],
+    this.through = choice([["", "none"], ...about.cameras.map((c) => [c.name, c.name])],
       "", (name) => this.look(name));
     this.wipe = slider(0, 1, 0.005, 0.5, (v) => this.wiped(v));
     this.see = slider(0, 1, 0.02, 1, (v) => {
@@ -191,7 +191,7 @@ export class Controls {
   async setMode(mode) {
     const { viewer } = this, { picture } = viewer;
     if (mode === "confidence" && !picture.sets.model.level) {
-      viewer.status("measuring how far each strand is from what was measured");
+      viewer.status("computing distances to measured points");
       try {
         picture.sets.model.level = picture.sets.model.perPoint(await net.bytes("/confidence"));
         viewer.status("");
@@ -219,7 +219,7 @@ export class Controls {
         confidence: `yellow: measured there; dark: ${about.confidence_mm} mm and more from any ` +
           "measured point, grown by a rule",
         root: "hue: where on the scalp the strand is rooted",
-        length: `dark: short; yellow: ${longest} mm`, lit: "the fitted fibres, lit: see below" }[state.mode];
+        length: `dark: short; yellow: ${longest} mm`, lit: "the fitted material, see below" }[state.mode];
     viewer.draw();
   }
 }

@@ -1,4 +1,4 @@
-// What is drawn: head, strands, cameras; once while things move, as a mean of many when they rest.
+// Drawing of head, strands and cameras: one sample in motion, a mean of many at rest.
 
 import { Film, Program, buffer } from "./gl.js";
 import * as shaders from "./shaders.js";
@@ -161,7 +161,7 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The card works behind our back: nothing more is asked of it until it is `ready`.
+  // The graphics card works asynchronously: `ready` is whether it has finished.
   mark() {
     const gl = this.gl;
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -169,7 +169,7 @@ export class Picture {
     gl.flush();
   }
 
-  // Whether what was asked last is done; `took` is how long that was, in milliseconds.
+  // Whether the last commands are done; `took` is their time in milliseconds.
   ready() {
     const gl = this.gl;
     if (!this.fence) return true;

@@ -1,5 +1,5 @@
-// Light: dragged over the dome, painted on it, or out of an environment map; and what it does to
-// captured frames (sums, made by the server) and to the fitted model (the shader).
+// Relighting by the dome or an environment map, of captured frames (sums by the server) and of the
+// fitted model (the shader).
 
 import { choice, element, labelled, slider } from "./controls.js";
 import { texture } from "./gl.js";
@@ -155,7 +155,7 @@ export class Relight {
     await shown.decode();
     const missing = this.told.missing[camera];
     this.viewer.status(
-      missing ? `${missing} frames of ${camera} are missing: those of the nearest lights stand for them` : "");
+      missing ? `${missing} frames of ${camera} are missing: those of the nearest lights are used` : "");
   }
 
   async shade(body) {

@@ -1,4 +1,4 @@
-// The page: loads a model coarse to fine, turns it under the hand, and shows what there is.
+// The page: loads a model coarse to fine and handles input.
 
 import { context } from "./gl.js";
 import { Hair, Head } from "./hair.js";
@@ -190,7 +190,7 @@ function askForToken(why) {
     Object.assign(document.createElement("h1"), { textContent: "A token is needed" }),
     Object.assign(document.createElement("p"),
       { textContent: "Yours is printed by: hairstage token show" }), field,
-    Object.assign(document.createElement("button"), { textContent: "Look" }));
+    Object.assign(document.createElement("button"), { textContent: "Open" }));
   form.addEventListener("submit", async (e) => {
     e.preventDefault();
     try {

@@ -1,4 +1,4 @@
-// What people do, whichever view they are in.
+// Actions shared by all views.
 
 import { ask, captureAt } from "./ask.js";
 import { button, h, seconds } from "./dom.js";

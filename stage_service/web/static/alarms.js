@@ -1,4 +1,4 @@
-// What has to be read, above every view: it stays until its cause has gone.
+// Alarms above every view, shown until their cause has gone.
 
 import { attempt } from "./acts.js";
 import { ask } from "./ask.js";
@@ -36,14 +36,14 @@ function refusal() {
   if (!why) return null;
   const login = why.kind === "unauthorized";
   return alarm("", login ? "Log in again. The stage was NOT darkened: press the wired emergency stop." : "The stage was NOT darkened: press the wired emergency stop.",
-    `Blackout of ${clock(pressed.at)} was refused: ${login ? "this page is not logged in, and has no valid right to send Blackout without a login. It is sent again as soon as you log in." : `${why.detail}.`} ${watchdogSentence()} `,
-    button(login ? "do not send it again" : "seen", () => dismiss(), { kind: "quiet" }));
+    `Blackout of ${clock(pressed.at)} was refused: ${login ? "this page is not logged in and has no blackout right. It is sent again as soon as you log in." : `${why.detail}.`} ${watchdogSentence()} `,
+    button(login ? "do not send it again" : "dismiss", () => dismiss(), { kind: "quiet" }));
 }
 
 function unanswered() {
   if (!pressed?.going || Date.now() - pressed.at < UNANSWERED_MS) return null;
-  return counting("", `Blackout of ${clock(pressed.at)} has not been answered for`, () => ago(pressed.at),
-    `${pressed.error ? `The service failed: ${pressed.error}. ` : ""}It is sent again until the service answers. ${STOP}`,
+  return counting("", `Blackout of ${clock(pressed.at)} has had no response for`, () => ago(pressed.at),
+    `${pressed.error ? `The service failed: ${pressed.error}. ` : ""}It is repeated until the service responds. ${STOP}`,
     silence() ? "" : ` ${watchdogSentence()}`);
 }
 
@@ -52,21 +52,21 @@ function answer() {
   if (!S.out || !pressed?.answer) return null;
   const { at, safe, detail } = pressed.answer;
   if (safe && contradicts(detail)) return alarm(".accepted", `Reported dark at ${clock(at)}.`, `Blackout of this page: ${detail}.`);
-  if (safe) return alarm(".calm", `Dark, verified at ${clock(at)},`, "by the blackout of this page. What has happened since is not shown before you log in.");
-  return alarm("", "UNSAFE: treat every lamp as lit.", `Blackout of ${clock(pressed.at)}, answered at ${clock(at)}: ${detail} ${watchdogSentence()} ${STOP}`);
+  if (safe) return alarm(".calm", `Dark, verified at ${clock(at)},`, "by the blackout of this page. Log in to see later events.");
+  return alarm("", "UNSAFE: treat every lamp as lit.", `Blackout of ${clock(pressed.at)}, response at ${clock(at)}: ${detail} ${watchdogSentence()} ${STOP}`);
 }
 
 function loggedOut() {
   if (!S.out || pressed?.refused) return null;
   if (right()) return alarm(".accepted", S.who ? "Your login has ended." : "You are not logged in.", "Nothing of the stage is shown. Blackout (F9) works without a login.");
-  return alarm("", "This page cannot darken the stage.", `Blackout (F9) needs a browser that has logged in here before. Log in, or press the wired emergency stop. ${watchdogSentence()}`);
+  return alarm("", "This page cannot darken the stage.", `Blackout (F9) needs a browser that was logged in here before. Log in, or press the wired emergency stop. ${watchdogSentence()}`);
 }
 
 function silent() {
   const since = silence();
   if (!since || document.hidden) return null;
-  return counting("", `No answer from the service since ${since.clock}:`, () => silence()?.seconds ?? 0,
-    `The stage may be lit, and what is shown is of ${since.clock}. ${watchdogSentence(since)} If only the connection is lost, lamps stay as the service commands them. The page goes on trying.`);
+  return counting("", `No response from the service since ${since.clock}:`, () => silence()?.seconds ?? 0,
+    `The stage may be lit, and the page shows the state of ${since.clock}. ${watchdogSentence(since)} If only the connection is lost, lamps stay as the service commands them. The page keeps trying.`);
 }
 
 function polling() {
@@ -84,7 +84,7 @@ function stage() {
 function failed(latch) {
   const { id, error } = S.failed;
   const why = latch ? (error ?? "").split("; blackout: ")[0] : error ?? "";
-  return alarm("", `Capture ${id} failed.`, `${latch?.detail.includes(why) ? "The reason is above." : why} `, button("seen", () => {
+  return alarm("", `Capture ${id} failed.`, `${latch?.detail.includes(why) ? "The reason is above." : why} `, button("dismiss", () => {
     sessionStorage.setItem("seen", id);
     S.failed = null;
     changed();
@@ -98,7 +98,7 @@ function unsafe(latch) {
   return { key, make: () => {
     const name = h("input", { name: "name", required: true, minlength: 2, placeholder: "your name", "aria-label": "your name" });
     const note = h("input", { name: "note", required: true, minlength: 4, placeholder: "what you saw", "aria-label": "what you saw" });
-    return { element: h(".alarm.latch", why(), h("p", "This light bank cannot report whether its lamps are off. Nothing is lit until somebody has looked and confirms it:"),
+    return { element: h(".alarm.latch", why(), h("p", "This light bank cannot report whether its lamps are off. No lamp is lit until a person has inspected the stage and confirms it:"),
       h("form.line", { onsubmit: (event) => {
         event.preventDefault();
         attempt(() => ask("POST /devices/acknowledge", { name: name.value, note: note.value })).then(() => load.health());

@@ -1,4 +1,4 @@
-// The API: JSON in and out, problems as errors, in the name of whoever has logged in.
+// Requests to the API: JSON, problems as errors.
 
 import { local } from "./dom.js";
 

@@ -1,4 +1,4 @@
-// A screen that does not light the subject. Any key or touch ends it, and so does what must be seen.
+// A black screen that does not light the subject; a key, a touch or an alarm ends it.
 
 import { h } from "./dom.js";
 import { pressed } from "./blackout.js";

@@ -1,4 +1,4 @@
-// Blackout, in every state of the page: logged in or not, and for as long as nobody answers.
+// Blackout in every state of the page, repeated until the service responds.
 
 import { ask, service, tell } from "./ask.js";
 import { local } from "./dom.js";

@@ -1,4 +1,4 @@
-// A board in several poses and a sphere in several places; what each picture shows; the rig that comes of it.
+// Calibration: captures of a board and of spheres, detected corners, the calibrated rig.
 
 import { attempt, steering, underLease } from "./acts.js";
 import { ask, captureAt, get } from "./ask.js";

@@ -1,4 +1,4 @@
-// What the cameras see now: one exposure, again and again where somebody wants it.
+// Snapshots: one exposure, or one every few seconds.
 
 import { attempt, steering } from "./acts.js";
 import { ask, get } from "./ask.js";

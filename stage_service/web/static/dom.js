@@ -1,4 +1,4 @@
-// Making elements, and saying numbers as people do.
+// Elements, and formatting of numbers.
 
 /** An element: `h("p.quiet", {title}, "text", child)`. Attributes that begin with "on" listen. */
 export function h(name, attributes, ...children) {

@@ -1,4 +1,4 @@
-// A form from a JSON schema, as pydantic writes it: what is left empty is left out.
+// A form from a JSON schema of pydantic; empty fields are omitted.
 
 import { h, numberIn, words } from "./dom.js";
 
@@ -79,7 +79,7 @@ export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
   }
 
   return {
-    element: h("", h("fieldset", h("legend", "what to shoot"), groups[0]), groups.slice(1)),
+    element: h("", h("fieldset", h("legend", "capture"), groups[0]), groups.slice(1)),
     value() {
       const out = {};
       for (const { path, read } of fields) {

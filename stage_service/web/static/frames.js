@@ -1,4 +1,4 @@
-// Captures and their frames: by camera, by light, and as a film.
+// Captures and their frames, by camera and by light.
 
 import { attempt } from "./acts.js";
 import { captureAt, get } from "./ask.js";

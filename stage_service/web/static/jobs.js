@@ -1,4 +1,4 @@
-// What is made of captures: how far, how good, how long, and what has come of it.
+// Jobs: progress, error against time, warnings and files.
 
 import { attempt } from "./acts.js";
 import { ask, get } from "./ask.js";

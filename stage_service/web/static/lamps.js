@@ -1,4 +1,4 @@
-// What is known of the lamps, in this console's words: none that claims more than was read back, or longer ago than is shown.
+// Texts for the state of the lamps, which never claim more than was read back.
 
 import { S, silence } from "./state.js";
 
@@ -43,14 +43,14 @@ export function lampWords(health) {
   const silent = silence();
   if (!silent) return known;
   return {
-    ...known, bar: "no answer", tone: "bad", headline: `No answer since ${silent.clock}`, lit: "not known what is lit",
+    ...known, bar: "no response", tone: "bad", headline: `No response since ${silent.clock}`, lit: "not known what is lit",
     fact: `not known; at ${silent.clock}: ${known.fact}`,
   };
 }
 
 function alarm(state, detail) {
-  if (state === "accepted") return ["Off was sent, but the light bank cannot report whether the lamps are off. ", `${detail} A blackout cannot find out: look before anybody goes in.`];
-  if (state === "doubted") return ["Reported dark by a light bank whose read-back contradicted a command. ", `${contradicts(S.capture?.error) ? `In capture ${S.capture.id} it` : "It"} reported lamps as off that were commanded on. Look before anybody goes in.`];
+  if (state === "accepted") return ["Off was sent, but the light bank cannot report whether the lamps are off. ", `${detail} A blackout cannot verify it: inspect the stage before anybody enters.`];
+  if (state === "doubted") return ["Reported dark by a light bank whose read-back contradicted a command. ", `${contradicts(S.capture?.error) ? `In capture ${S.capture.id} it` : "It"} reported lamps as off that were commanded on. Inspect the stage before anybody enters.`];
   if (state === "unknown" && detail) return ["It is not known whether the lamps are off. ", `${detail} A blackout (F9) sends off, and reads it back where the device can.`];
   return null;
 }

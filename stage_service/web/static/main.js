@@ -1,4 +1,4 @@
-// The frame around every view: where the stage is, what is wrong, and the buttons that put lamps off.
+// The frame around every view: state, alarms, abort and blackout.
 
 import { abort, askName, attempt, left, notice } from "./acts.js";
 import { alarmBox } from "./alarms.js";
@@ -80,13 +80,13 @@ function bar() {
     }
     views.hidden = who.hidden = S.out;
     const other = S.lease.holder !== null && !mine();
-    say(steering, S.lease.holder === null ? "nobody steers" : mine() ? "you steer" : `${S.lease.holder} steers`);
+    say(steering, S.lease.holder === null ? "no lease" : mine() ? "you steer" : `${S.lease.holder} steers`);
     steering.title = S.lease.holder === null ? "anybody may start a capture" : `until ${clock(S.lease.expires)}`;
     say(held, mine() ? "release" : "take");
     held.hidden = other || !(S.who?.scopes.includes("steer"));
     stop.disabled = S.out || !busy() || c.state === "aborting" || c.state === "finishing";
     const waiting = pressed?.going ? Math.floor((Date.now() - pressed.at) / 1000) : 0;
-    say(label, !pressed?.going ? "Blackout" : waiting < 2 ? "going dark …" : `no answer: ${waiting} s`);
+    say(label, !pressed?.going ? "Blackout" : waiting < 2 ? "going dark …" : `no response: ${waiting} s`);
     dark.classList.toggle("going", Boolean(pressed?.going));
   };
 }
@@ -139,7 +139,7 @@ async function start() {
     await begin();
   } catch (error) {
     if (error.status === 401) return;
-    say(view, h("p.bad", `The service does not answer (${error.message}). The page tries again.`));
+    say(view, h("p.bad", `The service does not respond (${error.message}). The page tries again.`));
     setTimeout(start, 2000);
     return;
   }
@@ -149,7 +149,7 @@ async function start() {
       addEventListener("hashchange", show);
       show();
     } else if (S.rig) shown?.update?.();
-    else if (S.problem && !S.out) say(view, h("p.bad", `The service does not answer what this page needs: ${S.problem}. The page tries again.`));
+    else if (S.problem && !S.out) say(view, h("p.bad", `The service refuses data that this page needs: ${S.problem}. The page tries again.`));
   });
   changed();
 }

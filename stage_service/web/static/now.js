@@ -1,4 +1,4 @@
-// The stage as it is: the light that is lit, how far the capture is, and how it stands with darkness.
+// The present state: lit light, progress of the capture, lamps, queue.
 
 import { confirmed, left, nameIn, steering } from "./acts.js";
 import { ask, captureAt, get } from "./ask.js";
@@ -18,7 +18,7 @@ const SAID = {
 
 const HOW = { completed: "is complete", aborted: "was aborted", failed: "failed", interrupted: "was interrupted", damaged: "is damaged" };
 const HEADLINES = { idle: "Starting", running: "Shooting", pausing: "Pausing …", paused: "Paused", aborting: "Aborting …", finishing: "Finishing …" };
-const SLOW_MS = 1000; // a step that takes longer shows how many cameras have answered
+const SLOW_MS = 1000; // a step that takes longer shows how many cameras have responded
 
 export function open(view) {
   const picture = dome(S.rig, { label: "the dome from above, with the light that is lit" });
@@ -34,7 +34,7 @@ export function open(view) {
   const resume = steering("Resume", () => steer("resume"), { kind: "go", lights: true, ready: () => ["paused", "pausing"].includes(S.capture?.state) });
   const finish = steering("Shoot what is missing", () => steer("resume"), { lights: true, ready: () => S.capture?.state === "done" && !["completed", "damaged"].includes(S.capture?.outcome) });
   const fresh = h("a.button", { href: "#plan" }, "New capture");
-  const goOn = steering("Go on with the queue", () => release(S.queue.hold), { lights: true, ready: () => S.queue.hold !== null });
+  const goOn = steering("Release the queue", () => release(S.queue.hold), { lights: true, ready: () => S.queue.hold !== null });
   const line = h("ol.queue");
   const queueSaid = h("p.quiet");
   view.append(h(".now",
@@ -57,7 +57,7 @@ export function open(view) {
   async function release(hold) {
     if (!hold) return;
     const reasons = hold.reasons.map((r) => h("li", `${clock(r.at)}: ${local(r.why)}`));
-    await confirmed("go on with the queue", [h("p", "The queue is held:"), h("ul.problems", reasons), h("p", "Begin the queued captures, one after the other?")], "Begin");
+    await confirmed("release the queue", [h("p", "The queue is held:"), h("ul.problems", reasons), h("p", "Begin the queued captures, one after the other?")], "Begin");
     try {
       await ask("POST /queue:go-on", { hold: hold.id });
     } finally {
@@ -148,7 +148,7 @@ export function open(view) {
   }
   function disk() {
     const free = S.health?.disk_free_bytes;
-    return ["Disk", free === null ? h("b.bad", "does not answer") : `${bytes(free)} free`];
+    return ["Disk", free === null ? h("b.bad", "does not respond") : `${bytes(free)} free`];
   }
   function tell(rows) {
     keyed(facts, rows.filter(Boolean), ([name]) => name, ([name]) => {
@@ -175,7 +175,7 @@ export function open(view) {
     });
     const what = !running || !now.kind ? (busy() ? SAID[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
-    const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have answered` : "";
+    const answered = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have responded` : "";
     say(lit, busy() && !silence() ? what + answered : lampWords(S.health).lit);
   }
 
@@ -209,9 +209,9 @@ export function open(view) {
 
   function queueOf() {
     const q = S.queue;
-    say(queueSaid, q.held ? `Held: ${q.held}. No queued capture begins until somebody goes on with the queue.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "The queue is empty.");
+    say(queueSaid, q.held ? `Held: ${q.held}. No queued capture starts until the queue is released.` : q.waiting.length ? (q.waits_for ? `The first one waits: ${q.waits_for}.` : "The first one is about to begin.") : "The queue is empty.");
     keyed(line, q.waiting, (x) => x.id, (x) => {
-      const go = steering("start now", async () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: await nameIn("Who at the stage answers for the flashes", "Start") } : undefined), { kind: "quiet", lights: true });
+      const go = steering("start now", async () => ask(`POST /queue/${x.id}/start`, x.needs_arming ? { armed_by: await nameIn("Person at the stage responsible for the flashes", "Start") } : undefined), { kind: "quiet", lights: true });
       const up = steering("first", () => ask(`PATCH /queue/${x.id}`, { place: 0 }), { kind: "quiet" });
       const at = () => S.queue.waiting.findIndex((y) => y.id === x.id);
       const place = (text, by, more) => steering(text, () => ask(`PATCH /queue/${x.id}`, { place: at() + by }), { kind: "quiet", ready: () => S.queue.waiting[at() + by] !== undefined, ...more });

@@ -1,4 +1,4 @@
-// All cameras side by side: a frame of each, how it is exposed, and what is drawn over it.
+// A frame of each camera side by side, with exposure and overlays.
 
 import { get, service } from "./ask.js";
 import { pressed } from "./blackout.js";

@@ -1,4 +1,4 @@
-// What to shoot, and what that takes, as one types; then the stage, or its queue.
+// A plan with its cost, started or queued.
 
 import { attempt, notice, steering, underLease } from "./acts.js";
 import { ask, get } from "./ask.js";
@@ -44,7 +44,7 @@ export function open(view) {
       form.element,
       h("fieldset", h("legend", "lights"), h("p.quiet", "Click lights to choose them. Without a choice all are shot."), h(".picker", picker.element)),
       then.element,
-      h("details", h("summary", "how a plan is read"), h("p.quiet", schemas.CapturePlan.description)),
+      h("details", h("summary", "fields of a plan"), h("p.quiet", schemas.CapturePlan.description)),
     );
     typed();
   }).catch((error) => say(main, h("p.bad", error.message)));
@@ -74,14 +74,14 @@ export function open(view) {
       if (mine !== asked) return;
       cost = null;
       const problems = error.data?.problems ?? error.data?.errors?.map((e) => `${e.loc}: ${e.msg}`) ?? [error.message];
-      say(side, h("h2", "This cannot be shot"), h("ul.problems", problems.map((text) => h("li", text))));
+      say(side, h("h2", "This plan cannot be shot"), h("ul.problems", problems.map((text) => h("li", text))));
     }
     side.append(arming, h(".line", start.element, queue.element), h("p.quiet", "Starting takes the lease: until you release it, others may abort and send Blackout, but not steer."));
     update();
   }
 
   const armed = h("input", { name: "armed_by", maxlength: 100, autocomplete: "name" });
-  const arming = h("label", h("span.warn", "who answers at the stage for the flashes"), armed);
+  const arming = h("label", h("span.warn", "person at the stage responsible for the flashes"), armed);
 
   function costOf(c) {
     const causes = Object.entries(c.seconds_by_cause).filter(([, s]) => s > 0).sort((a, b) => b[1] - a[1]);
@@ -89,7 +89,7 @@ export function open(view) {
     const f = c.flash;
     const free = S.health?.disk_free_bytes;
     return [
-      h("h2", "What it takes"),
+      h("h2", "Cost"),
       h("dl.facts", Object.entries({
         "Time": seconds(c.seconds), "Frames": number(c.frames),
         "Steps": number(c.steps), "Disk": h(free !== null && c.bytes > free ? "b.bad" : "span", `${bytes(c.bytes)}${free ? ` of ${bytes(free)}` : ""}`),
@@ -97,9 +97,9 @@ export function open(view) {
         "Flashes": h(f.needs_consent ? "b.warn" : "span", `${f.hz ? `${number(f.hz)} Hz, ` : ""}${f.band}`), "Limited by": c.limited_by,
       }).map(([name, value]) => h("div", h("dt", name), h("dd", value)))),
       h(".bars", causes.map(([name, s]) => [h("span", words(name)), h("progress", { max: most, value: s, "aria-label": name }), h("span.n", seconds(s))])),
-      f.needs_consent ? h("p.note", "Flashes of 3 to 30 Hz before a living subject: record the consent in the plan and name who answers for it at the stage, or choose the preset “slow, for eyes”.") : null,
+      f.needs_consent ? h("p.note", "Flashes of 3 to 30 Hz before a living subject: record the consent in the plan and name the person at the stage responsible for it, or choose the preset “slow, for eyes”.") : null,
       h("p.quiet", c.stepping_why),
-      c.left_out.map((x) => h("p.note", `Left out: ${x.what}: ${x.why} (saves ${x.saved})`)),
+      c.left_out.map((x) => h("p.note", `Skipped: ${x.what}: ${x.why} (saves ${x.saved})`)),
     ];
   }
 
@@ -141,7 +141,7 @@ function thenFields() {
   });
   const names = (field) => field.value.split(/[\s,]+/).filter(Boolean);
   return {
-    element: h("fieldset", h("legend", "subject, and what follows"), h(".fields",
+    element: h("fieldset", h("legend", "subject and job"), h(".fields",
       h("label", h("span", "uploaded subject"), uploads), h("label", h("span", "or head"), head), h("label", h("span", "and masks"), masks),
       h("label", h("span", "then run"), pipeline), h("label", h("span", "held-out cameras"), held), h("label", h("span", "held-out lights"), heldLights))),
     value() {

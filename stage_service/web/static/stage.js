@@ -1,4 +1,4 @@
-// The devices, what is wrong with them, who steers, and who did what.
+// Devices, lease, audit log.
 
 import { attempt } from "./acts.js";
 import { ask, get } from "./ask.js";
@@ -19,7 +19,7 @@ export function open(view) {
   devices.style.setProperty("--cell", "16rem");
   view.append(
     h("h1", "The stage"), health, problems,
-    h("section.devices", h(".line", h("h2", "Devices"), button("Query them again", askAll, { kind: "quiet" }), age), devices),
+    h("section.devices", h(".line", h("h2", "Devices"), button("Query again", askAll, { kind: "quiet" }), age), devices),
     h("section", h("h2", "Who steers"), lease),
     h("section", h("h2", "Audit log"), h(".wide", { tabindex: "0", role: "region", "aria-label": "audit log" }, h("table", h("thead", h("tr", ["time", "who", "action", "subject", "result", "reason"].map((x) => h("th", x)))), rows))),
   );
@@ -48,7 +48,7 @@ export function open(view) {
         const bad = d.state === "unreachable" || (but && lampState(S.health) !== "accepted");
         element.className = `device ${bad ? "unreachable" : d.state === "ok" ? "" : "asked"}`;
         say(name, kind);
-        say(state, h(bad ? "b.bad" : "span", but ? `${d.state === "ok" ? "answers" : d.state}, ${but}` : d.state), d.error ? ` ${d.error}` : "");
+        say(state, h(bad ? "b.bad" : "span", but ? `${d.state === "ok" ? "responds" : d.state}, ${but}` : d.state), d.error ? ` ${d.error}` : "");
         const told = { ...d, ...d.since_start };
         say(figures, ...Object.entries(told).filter(([k]) => !["name", "state", "error", "since_start"].includes(k)).map(([k, v]) => h("div", h("dt", words(k)), h("dd", Array.isArray(v) ? v.map((x) => (typeof x === "object" ? JSON.stringify(x) : x)).join(", ") : String(v)))));
       } };
@@ -76,7 +76,7 @@ export function open(view) {
     say(health, ...Object.entries(facts).map(([k, v]) => h(v.length > 40 ? "div.long" : "div", h("dt", k), h("dd", v))));
     say(problems, ...x.problems.map((text) => h("li", text)));
     const held = S.lease.holder;
-    say(lease, held === null ? "Nobody holds the lease: anybody may steer." : `${held}, until ${clock(S.lease.expires)}.`,
+    say(lease, held === null ? "Nobody holds the lease." : `${held}, until ${clock(S.lease.expires)}.`,
       held !== null && S.who?.scopes.includes("admin") ? button("end this lease", () => attempt(async () => { await ask("DELETE /lease?force=true"); await load.lease(); }), { kind: "quiet" }) : "");
   }
   return { update, end() { clearTimeout(timer); for (const kind of TOLD) events.removeEventListener(kind, onEvent); } };

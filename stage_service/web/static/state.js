@@ -1,4 +1,4 @@
-// What the page knows of the service: asked for once, then kept by events.
+// The state of the service, requested once and updated by events.
 
 import { ask, captureAt, get, own, service } from "./ask.js";
 import { keepRight, pressed } from "./blackout.js";
@@ -90,7 +90,7 @@ export const unlit = () => (S.health?.latch ? "UNSAFE: no lamp may be lit before
 
 /** Why this page may not steer now; null: it may. */
 export function refused() {
-  if (silence()) return "the service does not answer";
+  if (silence()) return "the service does not respond";
   if (S.who && !S.who.scopes.includes("steer")) return "your token lacks the scope steer";
   if (S.lease.holder !== null && !mine()) return `${S.lease.holder} steers the stage until ${clock(S.lease.expires)}`;
   return null;

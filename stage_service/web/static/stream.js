@@ -1,4 +1,4 @@
-// The service's events, for as long as the page is open: over dead networks and restarts.
+// The service's event stream, reconnected after failures and restarts.
 //
 // `fetch` instead of `EventSource`: it has the status of a refusal, and the comments that the service sends
 // every second, so that a line that is dead without having ended is noticed.

@@ -70,4 +70,4 @@ def test_it_has_at_most_25_lines_however_many_warnings_there_are():
     many = [f"masks: {n} pixels {'and others ' * 40}: check the poses" for n in range(30)]
     lines = last_screen({**RESULTS, "warnings": many}, Path("runs/demo")).splitlines()
     assert len(lines) <= 25
-    assert any(line.startswith("Warnings that ask for an action: 30") for line in lines)
+    assert any(line.startswith("Warnings to act on: 30") for line in lines)

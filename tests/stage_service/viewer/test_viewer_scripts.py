@@ -78,7 +78,7 @@ def test_the_latest_light_is_shown_though_one_before_it_failed(run):
         relight.apply = async () => {
           const { number } = relight.weights;
           await null;
-          if (number === 1) throw new Error("no answer");
+          if (number === 1) throw new Error("no response");
           shown.push(number);
         };
         const first = relight.set({ number: 1 });
@@ -87,7 +87,7 @@ def test_the_latest_light_is_shown_though_one_before_it_failed(run):
         out = [shown, said];"""
     )
     assert shown == [2]
-    assert said == ["no answer"]
+    assert said == ["no response"]
 
 
 def test_a_camera_chosen_before_light_is_there_shows_its_frames(run):

@@ -290,9 +290,9 @@ def test_a_lamp_that_stays_lit_is_named_when_blackout_is_pressed(stage, film):
 
 def no_answer(page: Any, desk: Desk) -> None:
     """The page claims nothing of now while nothing comes from the service."""
-    page.wait_for_selector("h1:has-text('No answer since')")
+    page.wait_for_selector("h1:has-text('No response since')")
     page.wait_for_selector("circle.light.lit", state="detached")
-    alarm = page.text_content(".alarm:has-text('No answer from the service since')")
+    alarm = page.text_content(".alarm:has-text('No response from the service since')")
     assert "the light bank's watchdog puts the lamps off" in alarm
     assert f"{desk.watchdog_s:g} s after the service's last heartbeat" in alarm
     for claim in ("Dark, verified", "Shooting"):
@@ -316,7 +316,7 @@ def press_unanswered(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> Non
         no_answer(page, desk)
         press(page)
     for page in pages.values():
-        alarm = page.wait_for_selector(".alarm:has-text('has not been answered for')")
+        alarm = page.wait_for_selector(".alarm:has-text('has had no response for')")
         assert "Press the wired emergency stop" in alarm.text_content()
 
 
@@ -333,7 +333,7 @@ def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
     done = "#notices" if login == "kept" else ".alarm"
     for page in pages.values():
         page.wait_for_selector(f"{done}:has-text('Dark, verified')")
-        page.wait_for_selector(".alarm:has-text('has not been answered for')", state="detached")
+        page.wait_for_selector(".alarm:has-text('has had no response for')", state="detached")
     actions = [a["action"] for a in desk.http.get("/audit").json()]
     assert actions[-2:] == ["blackout", "blackout"]
     if login == "ended":
@@ -357,6 +357,6 @@ def test_blackout_over_a_frozen_service_is_shown_as_not_answered(desk, film):
     desk.process.send_signal(signal.SIGCONT)
     for page in pages.values():
         page.wait_for_selector("#notices:has-text('Dark, verified'), #notices:has-text('Reported')")
-        page.wait_for_selector(".alarm:has-text('No answer from the service')", state="detached")
+        page.wait_for_selector(".alarm:has-text('No response from the service')", state="detached")
     assert not desk.lit
     assert film.wrong == [], "\n".join(film.wrong)

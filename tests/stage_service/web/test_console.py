@@ -127,9 +127,9 @@ def test_a_slow_step_says_how_many_cameras_have_answered(console, monkeypatch):
     http, pages = console()
     page = pages.open()
     http.post("/captures", json={"plan": PACED}).raise_for_status()
-    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have answered')")
+    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have responded')")
     go_on.set()
-    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have answered')", state="detached")
+    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have responded')", state="detached")
     page.keyboard.press("F9")
     says(page, "Dark, verified")
 
@@ -193,7 +193,7 @@ def test_a_lamp_that_stays_lit_cannot_be_missed(console):
     says(page, "UNSAFE")
     page.click("nav >> text=Stage")
     card = page.wait_for_selector(".device:has(h3:text-is('lights'))")
-    assert "answers, but unsafe" in card.text_content()
+    assert "responds, but unsafe" in card.text_content()
     assert "unreachable" in card.get_attribute("class"), "it is marked as what needs somebody"
 
 
@@ -221,10 +221,10 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     sent = "off was sent; the light bank cannot report what is lit"
     alarm = told("Off was sent, not read back", "off was sent", sent)
     assert "the light bank cannot report whether the lamps are off" in alarm
-    assert "A blackout cannot find out: look before anybody goes in." in alarm
+    assert "A blackout cannot verify it: inspect the stage before anybody enters." in alarm
     page.click("nav >> text=Stage")
     page.wait_for_selector(
-        ".device:has-text('answers, but cannot report whether its lamps are off')"
+        ".device:has-text('responds, but cannot report whether its lamps are off')"
     )
     assert "safe" not in page.text_content("#view .grid")
     page.click("nav >> text=Now")
@@ -260,7 +260,7 @@ def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
     page.keyboard.press("F9")
     says(page, "Dark, verified")
     http.delete("/lease", headers=mine)
-    page.wait_for_selector("text=nobody steers")
+    page.wait_for_selector("text=no lease")
 
 
 def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
@@ -303,7 +303,7 @@ def test_a_service_that_is_started_again_is_found_by_the_open_page(simulated, br
         page = pages.open()
         says(page, "Dark, verified")
         before = page.evaluate("performance.timeOrigin")
-    page.wait_for_selector(".alarm:has-text('No answer from the service')")
+    page.wait_for_selector(".alarm:has-text('No response from the service')")
     with serving(rig_file, tmp_path / "root", port=port) as http:
         page.wait_for_selector(".alarm", state="detached")
         http.post("/captures", json={"plan": PACED}).raise_for_status()

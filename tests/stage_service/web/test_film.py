@@ -115,7 +115,7 @@ def test_a_capture_as_a_film(hold, console, film, demo, demo_rig):
     page.wait_for_selector(".cost:has-text('8 Hz')")
     film.take(page, "plan_with_cost")
     page.fill("[name=lights]", "light_400")
-    page.wait_for_selector("text=This cannot be shot")
+    page.wait_for_selector("text=This plan cannot be shot")
     film.take(page, "plan_that_cannot_be")
     pages.complaints.clear()  # Chromium's own, of the refusal
     page.fill("[name=lights]", "")
@@ -128,7 +128,7 @@ def test_a_capture_as_a_film(hold, console, film, demo, demo_rig):
     says(page, "Shooting")
     page.wait_for_selector(".missing >> text=shot again")
     film.take(page, "shooting")
-    page.wait_for_selector("text=3 of 8 cameras have answered")
+    page.wait_for_selector("text=3 of 8 cameras have responded")
     film.take(page, "a_slow_step")
     page.keyboard.press("F7")
     page.wait_for_selector(".black:focus")
@@ -226,7 +226,7 @@ def test_what_has_gone_wrong_as_a_film(hold, simulated, browser, film, demo_rig,
         page.wait_for_selector(".cost .facts")
         film.take(page, "another_steers", brightest=2 * BRIGHTEST)
         assert pages.complaints == []
-    page.wait_for_selector("text=No answer from the service")
+    page.wait_for_selector("text=No response from the service")
     film.take(page, "no_connection", brightest=2 * BRIGHTEST)
     pages.close()
     assert film.wrong == [], "\n".join(film.wrong)

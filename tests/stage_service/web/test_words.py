@@ -50,13 +50,13 @@ def test_a_dialog_keeps_blackout_by_mouse_and_by_key(console):
     for press in (lambda: page.click("button.blackout"), lambda: page.keyboard.press("F9")):
         http.post("/captures", json={"plan": PACED}).raise_for_status()
         says(page, "Shooting")
-        page.click("text=Go on with the queue")
+        page.click("text=Release the queue")
         page.wait_for_selector("dialog:has-text('The queue is held')")
         press()
         says(page, "Dark, verified")
         page.click("dialog button:text-is('Cancel')")
         assert len(http.get("/queue").json()["waiting"]) == 1
-    page.click("text=Go on with the queue")
+    page.click("text=Release the queue")
     page.click("dialog button:text-is('Begin')")
     says(page, "Shooting")
     page.keyboard.press("F9")
