@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -95,16 +93,6 @@ def test_a_new_capture_begins_at_rest_and_a_resumed_one_does_not(world):
     assert poses(world, LINE, TRACKING, 3) == [0, 1, 0]
 
 
-def test_the_log_says_the_pose_of_each_pulse(world, tmp_path):
-    poses(world, TRACKING, LINE, TRACKING)
-    lines = (tmp_path / "exposures.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == [
-        {"pulse": 1, "pose": 0},
-        {"pulse": 2, "pose": 0},
-        {"pulse": 3, "pose": 1},
-    ]
-
-
 def shot(power=(0, 0, 0, 0, 0), show=None, pose=0):
     return Snapshot(1, np.array(power, float), show or Show(), pose)
 
@@ -160,10 +148,6 @@ def test_drift_reaches_what_was_asked_and_starts_at_rest():
     assert max(steps) < 0.75e-3
     assert not np.array_equal(drift.pose(5)[1], Drift(18, 1.5e-3, 5).pose(5)[1])
     assert np.array_equal(drift.pose(5)[1], Drift(18, 1.5e-3, 4).pose(5)[1])
-
-
-def test_a_subject_that_keeps_still_is_a_drift_of_nothing():
-    assert np.array_equal(Drift(5, 0.0, 1).pose(3)[0], np.eye(3))
 
 
 def test_shot_noise_grows_as_the_full_well_says():

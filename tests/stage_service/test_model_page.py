@@ -169,7 +169,7 @@ def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
         model.write_arrays(name, {"a": np.zeros(1)})
     assert "not used" not in (text := Page(model_page(model)).text)
     assert "rendered inverse rendering" in text.replace("renderedinverse", "rendered inverse")
-    assert "what the hair reflects beyond that is rendered too" in text
+    assert "reflectance that the material lacks" in text
     model.remove("hair_maps.npz")
     text = Page(model_page(model)).text
     assert "rendered inverse rendering" not in text.replace("renderedinverse", "rendered inverse")

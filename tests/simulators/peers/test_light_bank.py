@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
-from waiting import until
 
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
@@ -19,13 +18,6 @@ def status(bench):
 
 def coils(bench):
     return bench.lights.read_coils(0, count=5).bits[:5]
-
-
-def test_power_up_is_off_at_full_level(bench):
-    assert coils(bench) == [False] * 5
-    assert bench.lights.read_holding_registers(0, count=5).registers == [65535] * 5
-    assert bench.lights.read_holding_registers(1000, count=3).registers == [0, 0, 2000]
-    assert status(bench) == [0, 0, 5, 0x4853]
 
 
 def test_selector_lights_exactly_one_lamp(bench):
@@ -121,15 +113,6 @@ def test_hanging_bank_answers_nothing_but_its_watchdog_goes_on(start):
     client.close()
     bench.now[0] += 2.01
     assert not bench.world.lamps.power().any()
-
-
-def test_the_default_clock_is_real():
-    lamps = Lamps(3)
-    assert lamps.watch(100)
-    assert lamps.select(1)
-    assert lamps.power()[0] == 1
-    until(lambda: not lamps.power().any())
-    assert lamps.status() == (1, 0)
 
 
 @pytest.mark.parametrize("count", [0, 1001])

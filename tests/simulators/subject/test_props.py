@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from reconstruction import Camera, Light, Projector, Rig
 from reconstruction.calibration.boards import Board
-from simulators.__main__ import main
 from simulators.subject.props import BoardProp, PropResponder, SphereProp, board_pose, named_prop
 
 CAMERA = Camera.look_at("front", 64, 48, (0.9, 0.1, 0.1), (0, 0, 0), 20.0)
@@ -38,11 +34,6 @@ def test_a_boards_number_is_a_sixteenth_turn_about_the_stage() -> None:
         assert abs((off + 180) % 360 - 180) < 8
 
 
-@pytest.mark.parametrize("name", ["wavy", "board", "board:x", "hair.npz"])
-def test_other_names_are_no_props(name: str) -> None:
-    assert named_prop(name) is None
-
-
 def test_a_diffuse_sphere_shines_by_lambert_and_inverse_square() -> None:
     sphere = SphereProp(np.zeros(3), 0.05, 0.6)
     response = PropResponder(RIG, sphere).lights("front")
@@ -68,11 +59,3 @@ def test_rows_of_a_sweep_sum_to_the_beam_on_the_board() -> None:
     lit = (sweep.images.sum(axis=(0, 2))[shared] > 0.1) & (np.abs(row[index] - 5.5) < 5)
     assert lit.sum() > 100
     assert np.abs(brightest[shared][lit] - row[index][lit]).max() < 1.1
-
-
-def test_the_truth_of_a_prop_is_its_place(tmp_path: Path) -> None:
-    rig = tmp_path / "rig.json"
-    rig.write_text(json.dumps(RIG.to_dict()))
-    assert main(["--rig", str(rig), "--subject", "board:2", "--truth-only", str(tmp_path)]) == 0
-    told = json.loads((tmp_path / "prop.json").read_text())
-    assert told["rotation"] == board_pose(2, Board()).rotation.tolist()

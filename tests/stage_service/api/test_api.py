@@ -18,14 +18,12 @@ import uvicorn
 from serving import serving
 from waiting import until
 
-from reconstruction import Model, Step, read_exr
+from reconstruction import Model, read_exr
 from stage_service.api.app import create_app
 from stage_service.api.connections import LOOPBACK
 from stage_service.api.problems import KINDS, Problem
 from stage_service.config import LightRegisters, RigFile
 from stage_service.jobs.records import Job, PipelineRequest
-from stage_service.plan import resolved, steps
-from stage_service.plan.capture_plan import CapturePlan
 from stage_service.service import Service
 from stage_service.service_models import CaptureRequest, CaptureView, JobRequest, RigView
 
@@ -148,19 +146,6 @@ def test_a_capture_its_frames_and_its_job(http, server, head):
     refused = {"name": "fit", "options": {"held_out_cameras": ["cam_7"]}}
     refused = http.post("/jobs", json={"capture": done["id"], "pipeline": refused})
     assert "cam_7" in problem(refused, "bad-input")["detail"]
-
-
-def test_a_plan_is_expanded_once_for_a_capture(http, monkeypatch):
-    """Costing, the check of its flashes, the folder and the sequencer share one `ResolvedPlan`."""
-    expanded = []
-
-    def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
-        expanded.append(plan)
-        return steps.expand(plan, rig_file)
-
-    monkeypatch.setattr(resolved, "expand", expand)
-    assert capture_done(http, {"plan": SHORT})["outcome"] == "completed"
-    assert len(expanded) == 1
 
 
 def test_a_job_that_is_about_to_be_enqueued_can_be_cancelled(http, server, head, monkeypatch):
@@ -389,13 +374,6 @@ def test_progress_that_a_power_cut_left_ends_nothing(http, server, tmp_path, tex
     assert listed == {"job-8": None, "job-9": None}
 
 
-def test_a_stranger_host_name_is_refused(http):
-    refused = http.get("/health", headers={"Host": "rebound.example"})
-    assert refused.status_code == 421
-    assert "rebound.example" in problem(refused, "http")["detail"]
-    assert http.get("/health", headers={"Host": "localhost:8331"}).json()["status"] == "ok"
-
-
 def test_files_of_a_request_are_checked_before_anything_is_lit(http, world, tmp_path):
     (tmp_path / "head.obj").write_text("v 0 0 0\n")
     for body, named in (
@@ -467,85 +445,8 @@ def test_an_option_that_is_unknown_or_bad_is_refused_with_its_place(http, world,
     assert world.pulses == 0
 
 
-def test_every_route_of_the_api_is_there_and_documented(http):
+def test_every_route_is_documented(http):
     document = http.get("/openapi.json").json()
-    routes = {
-        f"{method.upper()} {path}" for path, item in document["paths"].items() for method in item
-    }
-    assert routes == {
-        "POST /plans:validate",
-        "POST /captures",
-        "POST /snapshot",
-        "GET /captures/{capture}/board/{camera}",
-        "POST /calibration",
-        "GET /calibration",
-        "GET /calibration/rig.json",
-        "GET /captures",
-        "GET /captures/{capture}",
-        "GET /captures/{capture}/steps",
-        "POST /captures/{capture}/pause",
-        "POST /captures/{capture}/resume",
-        "POST /captures/{capture}/abort",
-        "GET /captures/{capture}/frames/{step}/{camera}.exr",
-        "GET /captures/{capture}/frames/{step}/{camera}.png",
-        "GET /captures/{capture}/frames/{step}/{camera}.json",
-        "GET /rig",
-        "GET /view/models",
-        "GET /view/models/{name}/environments/{which}",
-        "GET /view/models/{name}/lighting",
-        "GET /view/models/{name}/visibility/{light}",
-        "GET /view/models/{name}/table",
-        "POST /view/models/{name}/indirect/view",
-        "POST /view/models/{name}/few",
-        "POST /view/models/{name}/sums/{camera}.png",
-        "PUT /view/models/{name}/environments/{file}",
-        "GET /view/models/{name}",
-        "GET /view/models/{name}/strands/{which}",
-        "GET /view/models/{name}/head",
-        "GET /view/models/{name}/confidence",
-        "POST /jobs",
-        "GET /jobs",
-        "GET /jobs/{job}",
-        "DELETE /jobs/{job}",
-        "GET /jobs/{job}/report",
-        "GET /jobs/{job}/artifacts",
-        "GET /jobs/{job}/artifacts/{path}",
-        "GET /devices",
-        "POST /devices/blackout",
-        "POST /devices/acknowledge",
-        "DELETE /captures/{capture}",
-        "GET /captures/{capture}/archive.tar",
-        "GET /models",
-        "DELETE /models/{model}",
-        "GET /models/{model}/archive.tar",
-        "GET /trash",
-        "DELETE /trash",
-        "POST /trash/{name}/restore",
-        "GET /uploads",
-        "DELETE /uploads/{subject}",
-        "PUT /uploads/{subject}/head.obj",
-        "PUT /uploads/{subject}/masks/{camera}.png",
-        "GET /queue",
-        "POST /queue",
-        "GET /queue/history",
-        "PATCH /queue/{entry}",
-        "DELETE /queue/{entry}",
-        "POST /queue/{entry}/start",
-        "POST /queue:hold",
-        "POST /queue:go-on",
-        "POST /lease",
-        "GET /lease",
-        "PATCH /lease",
-        "DELETE /lease",
-        "GET /audit",
-        "GET /health",
-        "GET /ready",
-        "GET /metrics",
-        "GET /events",
-        "POST /login",
-        "GET /login",
-        "POST /logout",
-    }
     for item in document["paths"].values():
         for operation in item.values():
             assert operation["summary"]

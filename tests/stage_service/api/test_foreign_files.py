@@ -55,7 +55,7 @@ def test_frames_that_somebody_put_there_are_shown_within_limits(http):
     for kind in ("png", "json"):
         answer, peak = grown(lambda k=kind: http.get(f"{url}.{k}"))
         assert slug(answer) == "damaged-capture"
-        expected = f"{frame}: the picture unpacks to 60000 × 60000 pixels; at most 160,000,000"
+        expected = f"{frame}: the image unpacks to 60000 × 60000 pixels; at most 160,000,000"
         assert answer.json()["detail"].startswith(expected)
         assert peak < 40
     frame.unlink()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -27,9 +26,7 @@ from reconstruction import (
     Strands,
     write_strands,
 )
-from simulators.subject.grooms import GROOMS
 from stage_service.cli import build_parser, main
-from stage_service.cli.stage.processes import SUBJECTS
 from stage_service.cli.support.children import Children
 from stage_service.cli.support.commands import (
     CommandError,
@@ -81,12 +78,6 @@ def test_where_no_terminal_is_a_line_says_each_end_that_is_reached(capsys):
             progress(what, share)
     told = capsys.readouterr().err.splitlines()
     assert told == ["bench:   0% one", "bench: 100% one", "bench: 100% two"]
-
-
-def test_the_version_is_told(capsys):
-    with pytest.raises(SystemExit):
-        main(["--version"])
-    assert re.fullmatch(r"hairstage \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 def test_help_is_fast_because_nothing_heavy_is_imported():
@@ -245,10 +236,6 @@ def test_a_word_that_is_wrong_costs_no_earlier_demo(capsys, tmp_path, monkeypatc
     code, data = run(capsys, "demo", "--out", tmp_path, *(w.format(tmp=tmp_path) for w in words))
     assert code == 3
     assert said in data["error"]["detail"]
-
-
-def test_the_subjects_are_those_that_a_simulated_rig_has():
-    assert set(SUBJECTS) == set(GROOMS)
 
 
 def test_an_unreachable_service_is_exit_code_4(capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from threading import Event
 from typing import Any
 
@@ -176,27 +175,6 @@ def test_what_was_shot_for_a_calibration_is_kept_whatever_view_is_open(console, 
     page.wait_for_selector(f".poses button:text-is('{capture['id']}')")
 
 
-def test_a_lamp_that_stays_lit_cannot_be_missed(console):
-    http, pages = console(Fault("lights", "stuck", 4))
-    page = pages.open()
-    http.post("/captures", json={"plan": {**PACED, "rate_hz": 50}})
-    alarm = page.wait_for_selector(".alarm.latch")
-    text = alarm.text_content()
-    assert "treat every lamp as lit" in text
-    assert "until a blackout reads every lamp back dark" in text
-    assert page.text_content("#top .state") == "unsafe"
-    assert alarm.bounding_box()["width"] == 1280
-    red = page.evaluate("getComputedStyle(document.querySelector('.alarm')).backgroundColor")
-    r, g, b = (int(x) for x in re.findall(r"\d+", red)[:3])
-    assert r > 40 > max(g, b)
-    assert page.query_selector("text=Dark, verified") is None
-    says(page, "UNSAFE")
-    page.click("nav >> text=Stage")
-    card = page.wait_for_selector(".device:has(h3:text-is('lights'))")
-    assert "responds, but unsafe" in card.text_content()
-    assert "unreachable" in card.get_attribute("class"), "it is marked as what needs somebody"
-
-
 UNREAD = """[devices.lights.registers]
 lit = "none"
 [devices.lights]
@@ -243,26 +221,6 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     assert "A blackout cannot find out" in told("Off was sent, not read back", "off was sent", sent)
 
 
-def test_another_who_steers_is_named_and_darkness_stays_open_to_all(console):
-    http, pages = console()
-    page = pages.open("plan")
-    page.wait_for_selector(".cost .facts")
-    begin = page.wait_for_selector("button:text-is('Start now'):enabled")
-    lease = http.post("/lease", json={"holder": "Eve", "seconds": 600}).json()
-    page.wait_for_selector("text=Eve steers")
-    page.wait_for_selector("button:text-is('Start now'):disabled")
-    assert "Eve steers the stage until" in begin.get_attribute("title")
-    mine = {"Hairstage-Lease": lease["token"]}
-    http.post("/captures", json={"plan": PACED}, headers=mine).raise_for_status()
-    page.click("nav >> text=Now")
-    says(page, "Shooting")
-    assert page.is_disabled("button:text-is('Pause')")
-    page.keyboard.press("F9")
-    says(page, "Dark, verified")
-    http.delete("/lease", headers=mine)
-    page.wait_for_selector("text=no lease")
-
-
 def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
     http, pages = console()
     page = pages.open()
@@ -281,37 +239,6 @@ def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
     assert [a.action for a in http.service.audit(10)] == ["blackout"]
     assert [c for c in pages.complaints if "503" not in c] == []
     pages.complaints.clear()
-
-
-def test_three_pages_show_the_same_and_any_of_them_aborts(console):
-    http, pages = console()
-    three = [pages.open() for _ in range(3)]
-    http.post("/captures", json={"plan": PACED}).raise_for_status()
-    for page in three:
-        says(page, "Shooting")
-        page.wait_for_selector("circle.light.lit")
-    three[1].keyboard.press("F8")
-    for page in three:
-        says(page, "Dark, verified")
-
-
-def test_a_service_that_is_started_again_is_found_by_the_open_page(simulated, browser, tmp_path):
-    rig_file, _ = simulated()
-    with serving(rig_file, tmp_path / "root") as http:
-        url, port = str(http.base_url).rstrip("/"), http.base_url.port
-        pages = Pages(browser, url)
-        page = pages.open()
-        says(page, "Dark, verified")
-        before = page.evaluate("performance.timeOrigin")
-    page.wait_for_selector(".alarm:has-text('No response from the service')")
-    with serving(rig_file, tmp_path / "root", port=port) as http:
-        page.wait_for_selector(".alarm", state="detached")
-        http.post("/captures", json={"plan": PACED}).raise_for_status()
-        says(page, "Shooting")
-        http.post("/devices/blackout")
-        says(page, "Dark, verified")
-        assert page.evaluate("performance.timeOrigin") == before, "nobody had to load it again"
-    pages.close()
 
 
 def test_a_list_of_ten_thousand_captures_is_paged(console, tmp_path):
@@ -455,27 +382,6 @@ def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
         says(page, "Dark, verified")
         pages.close()
     assert pages.complaints == []
-
-
-def test_a_question_that_is_lost_is_asked_again(console):
-    _, pages = console()
-    page = pages.open()
-    says(page, "Dark, verified")
-    left = [503]
-
-    def answer(route: Any) -> None:
-        if left:
-            route.fulfill(status=left.pop(), body="")
-        else:
-            route.continue_()
-
-    page.route("**/queue", answer)
-    page.reload()
-    says(page, "Dark, verified")
-    assert left == []
-    page.wait_for_selector("strong.state:text-is('dark')")
-    assert [c for c in pages.complaints if "503" not in c] == []
-    pages.complaints.clear()
 
 
 def test_what_is_removed_elsewhere_is_shown_no_more(console):

@@ -17,17 +17,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browsing import Pages, says
-from filming import BRIGHTEST, Film
-from serving import serving
+from browsing import says
+from filming import Film
 from waiting import until
 
 from reconstruction import Capture, Model
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
-from stage_service.api.gate import Access
 from stage_service.model_page import write_page
-from stage_service.records.tokens import Tokens
 
 pytestmark = pytest.mark.slow
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -206,40 +203,3 @@ def lease(page: Any) -> dict[str, str]:
     """The header by which the page steers."""
     token = page.evaluate("JSON.parse(sessionStorage.getItem('lease')).token")
     return {"Hairstage-Lease": token}
-
-
-def test_what_has_gone_wrong_as_a_film(hold, simulated, browser, film, demo_rig, tmp_path):
-    rig_file, _ = simulated(Fault("lights", "stuck", 30), rig=demo_rig)
-    with serving(rig_file, tmp_path / "root") as http:
-        pages = Pages(browser, str(http.base_url).rstrip("/"))
-        page = pages.open()
-        http.post("/captures", json={"plan": {**PACED, "rate_hz": 20}}).raise_for_status()
-        says(page, "UNSAFE")
-        page.wait_for_selector(".alarm:not(.latch)")
-        film.take(page, "unsafe", brightest=2 * BRIGHTEST)
-        page.click("nav >> text=Stage")
-        page.wait_for_selector(".device >> nth=9")
-        film.take(page, "unsafe_stage", brightest=2 * BRIGHTEST)
-        http.post("/lease", json={"holder": "Eve", "seconds": 600}).raise_for_status()
-        page.click("nav >> text=Plan")
-        page.wait_for_selector("text=Eve steers")
-        page.wait_for_selector(".cost .facts")
-        film.take(page, "another_steers", brightest=2 * BRIGHTEST)
-        assert pages.complaints == []
-    page.wait_for_selector("text=No response from the service")
-    film.take(page, "no_connection", brightest=2 * BRIGHTEST)
-    pages.close()
-    assert film.wrong == [], "\n".join(film.wrong)
-
-
-def test_the_form_that_asks_for_a_token(simulated, browser, tmp_path, film):
-    access = Access(Tokens(tmp_path / "none", "the key"))
-    with serving(simulated()[0], tmp_path / "root", access, all_read=False) as http:
-        pages = Pages(browser, str(http.base_url).rstrip("/"))
-        page = pages.open()
-        page.fill("[name=token]", "another")
-        page.keyboard.press("Enter")
-        page.wait_for_selector("form .bad:not(:empty)")
-        film.take(page, "login")
-        pages.close()
-    assert film.wrong == [], "\n".join(film.wrong)

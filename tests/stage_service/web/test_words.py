@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
 from datetime import datetime
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -94,23 +92,6 @@ def test_times_are_those_of_the_clock_on_the_wall(console, monkeypatch):
         page.evaluate(f"location.hash = '#{view}'")
         page.wait_for_selector(f"nav a[href='#{view}'][aria-current]")
         assert re.findall(r"\d{4}-\d\d-\d\dT\S*", page.inner_text("body")) == []
-
-
-def test_a_capture_whose_folder_has_blanks_is_shown_as_it_is_listed(console, tmp_path):
-    http, pages = console()
-    made = http.post("/captures", json={"plan": SHORT}).json()
-    until(lambda: http.get(f"/captures/{made['id']}").json()["outcome"] == "completed")
-    name = "by hand, 50 % #2?"
-    shutil.copytree(Path(made["path"]), tmp_path / "root/captures" / name)
-    http.service._captures.catalogue.adopt(name)
-    page = pages.open("frames")
-    page.click(f".list button:has-text({name!r})")
-    page.wait_for_selector(f"h2.title:text-is({name!r})")
-    loaded = "[...document.querySelectorAll('figure img')].filter(x => x.naturalWidth).length"
-    until(lambda: page.evaluate(loaded) == 2)
-    page.reload()
-    page.wait_for_selector(f"h2.title:text-is({name!r})")
-    page.wait_for_selector("dd:text-is('completed')")
 
 
 def test_blackout_overtakes_the_pictures_that_a_slow_service_sends(console, small_rig, monkeypatch):
