@@ -12,7 +12,7 @@ from browsing import says
 from waiting import until
 
 from simulators.peers.faults import Fault
-from stage_service.service import Service
+from stage_service.frames import Frames
 from stage_service.web.pages import STATIC
 
 pytestmark = pytest.mark.slow  # a browser costs some seconds of processor time a page
@@ -96,14 +96,14 @@ def test_times_are_those_of_the_clock_on_the_wall(console, monkeypatch):
 
 def test_blackout_overtakes_the_pictures_that_a_slow_service_sends(console, small_rig, monkeypatch):
     """A browser has six connections to a host; here pictures hold five, and the events one."""
-    go_on, waiting, make = Event(), [], Service.preview
+    go_on, waiting, make = Event(), [], Frames.preview
 
     def slow(*args: Any, **more: Any) -> bytes:
         waiting.append(1)
         assert go_on.wait(60)
         return make(*args, **more)
 
-    monkeypatch.setattr(Service, "preview", slow)
+    monkeypatch.setattr(Frames, "preview", slow)
     camera = small_rig[
         small_rig.index("[[cameras]]") : small_rig.index('[[cameras]]\nname = "cam_b')
     ]
