@@ -33,14 +33,6 @@ EVERY_NTH_LIGHT = 28
 TURNING_FRAMES = 36
 """Frames of the animation at the end."""
 
-FILES = (
-    "index.html",
-    "strands.npz",
-    "strands.hair",
-    "strands.usdc",
-    "appearance.json",
-    "report.json",
-)
 READY_S = 300.0
 """Deadline for a process of the demo to become ready."""
 
@@ -84,7 +76,6 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
         with ServiceClient(_start(children, args)) as service:
             capture = _capture(children, service, args, held_out, output)
             job = _job(children, service, capture["job"], out)
-        memory = children.peak_memory_gb()
 
     model = Model(out / "model")
     results = {
@@ -93,20 +84,12 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
         "seed": args.seed,
         "rig": rig.name,
         "held_out": held_out,
-        "peak_memory_gb": memory,
         "capture": {
             key: capture[key]
             for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
         },
         "job": job["id"],
         **model.json("results.json"),
-        "files": {
-            "capture": "capture",
-            "model": [f"model/{name}" for name in FILES],
-            "pictures": [
-                f"model/{n}" for n in model.artifacts() if Path(n).suffix in (".png", ".webp")
-            ],
-        },
     }
     (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
     output.result(results, last_screen(results, out))

@@ -94,17 +94,6 @@ class Children:
                     UNREACHABLE,
                 )
 
-    def peak_memory_gb(self) -> dict[str, float]:
-        """Peak memory of each running child, GB; empty where unknown."""
-        peaks = {}
-        for name, child in self._running:
-            with contextlib.suppress(OSError):
-                lines = Path(f"/proc/{child.pid}/status").read_text().splitlines()
-                found = [line.split() for line in lines if line.startswith("VmHWM")]
-                if found:
-                    peaks[name] = int(found[0][1]) * 1024 / 1e9
-        return peaks
-
     def _not_ready(self, name: str, child: subprocess.Popen[str], seconds: float) -> CommandError:
         code = child.poll()
         what = f"ended with exit code {code}" if code is not None else f"not ready in {seconds} s"

@@ -77,7 +77,6 @@ export function pictures(grid, signal) {
 
   return {
     show(path, more) { for (const camera of S.rig.cameras) cellOf(camera).show(path, more); },
-    caption(name, text) { say(grid.children[S.rig.cameras.findIndex((c) => c.name === name)].querySelector("figcaption"), text); },
     get busy() { return [...cells.values()].some((cell) => cell.busy); },
   };
 }
