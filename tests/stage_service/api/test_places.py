@@ -209,7 +209,7 @@ def test_streams_of_a_token_leave_the_console_its_own(callers):
     held = [callers.open("reader", "GET /events") for _ in range(each)]
     assert {status(link) for link in held} == {200}
     refused = callers.ask("reader", "GET /events")
-    assert_refused(refused, 429, "token 'reader'", f"has {each} event streams", "close one")
+    assert_refused(refused, 429, "token 'reader'", f"has {each} of", "event streams: close one")
     own = callers.open("ada", "GET /events")
     assert status(own) == 200
     callers.http.service.events.publish("test", {})
@@ -229,7 +229,7 @@ def test_answers_that_nobody_takes_are_ended(callers, world, monkeypatch):
     held = [callers.open("reader", tar, received=2048) for _ in range(LIMITS["downloads"].each)]
     assert {status(link) for link in held} == {200}
     refused = callers.ask("reader", tar)
-    assert_refused(refused, 429, "token 'reader' has 4 downloads", "read them to their end")
+    assert_refused(refused, 429, "token 'reader' has 4 of", "read them to their end")
     assert len(callers.ask("ada", tar).content) > 8 << 20
     assert_darkened(callers, world, "ada")
     assert_darkened(callers, world, "reader")
@@ -247,7 +247,7 @@ def test_a_slow_upload_keeps_nobody_else_waiting(callers, limit, monkeypatch):
     slow = [callers.open("bob", put, more) for _ in range(LIMITS["uploads"].steering)]
     asked = callers.http.service
     until(lambda: places_of(callers).held("uploads", Owner("bob", steers=True)) == 2)
-    assert_refused(callers.ask("bob", put, content=HEAD), 429, "token 'bob' has 2 uploads")
+    assert_refused(callers.ask("bob", put, content=HEAD), 429, "token 'bob' has 2 of")
     assert callers.ask("ada", put, content=HEAD).status_code == 200
     assert asked.storage.uploads()
     monkeypatch.setattr(bodies, "GRACE_S", 0.1)
@@ -270,7 +270,7 @@ def test_without_places_a_token_may_still_darken(callers, world, limit, monkeypa
     held = [callers.open("reader", "GET /events") for _ in range(2)]
     assert {status(link) for link in held} == {200}
     refused = callers.ask("reader", "GET /rig")
-    assert_refused(refused, 429, "token 'reader' has 2 connections, of 2 that it may have")
+    assert_refused(refused, 429, "token 'reader' has 2 of at most 2 connections")
     assert refused.headers["content-security-policy"].startswith("sandbox")
     assert_darkened(callers, world, "reader")
     for path in ("/", "/health", "/login"):
