@@ -60,7 +60,7 @@ def test_the_command_says_when_it_is_ready_and_ends_on_sigterm(rig_file, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--subject", "afro", "--state", "s"], "no subject 'afro'"),
+        (["--subject", "afro", "--state", "s"], "unknown subject 'afro'"),
         (["--state", "s", "--faults", "none.json"], "none.json"),
         (["--state", "x", "--seed", "-1"], "--seed must be at least 0, got -1"),
         (["--truth-only", "x", "--drift-mm", "nan"], "got 1 and nan"),

@@ -83,7 +83,7 @@ def test_everything_that_is_known_stands_on_the_page(model):
     text = Page(model_page(model)).text
     for said in (
         *("2 of 4 points", "0 m in all; a strand 100 mm, median", "50 µm"),
-        "β_M 0.33, to render these strands with; 95 % interval 0.28 to 0.39",
+        "β_M 0.33, for rendering these strands; 95 % interval 0.28 to 0.39",
         *("σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
         *("growth of strands look here", "voxels", "no hair", "3 of 4"),
         *("off mm0.5 (0.25 to 1.5: 10 to 90 %)", "50.0 / 25.0 / 33.3", "hull + vertical"),

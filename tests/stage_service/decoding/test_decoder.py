@@ -141,9 +141,9 @@ def test_a_decoder_that_dies_is_named_and_the_next_file_has_another(decoder):
         for one in victim():
             os.kill(one, number)
         thread.join()
-    assert told[0].startswith("head.obj: it ended the process that was to decode it")
+    assert told[0].startswith("head.obj: decoding it crashed")
     assert told[0].endswith("SIGSEGV")
-    assert told[1].startswith("head.obj: it ended the process that was to decode it")
+    assert told[1].startswith("head.obj: decoding it crashed")
     assert len(decoder.head(bombs.obj(2), "head.obj").faces) == 2
 
 
@@ -201,7 +201,7 @@ def test_nothing_is_begun_after_the_end(decoder):
     process = pid(decoder)
     decoder.close()
     assert gone(process)
-    with pytest.raises(DecoderBusy, match="being stopped"):
+    with pytest.raises(DecoderBusy, match="stopping"):
         decoder.head(bombs.obj(1), "head.obj")
 
 
