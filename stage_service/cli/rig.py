@@ -88,7 +88,7 @@ def _table(data: dict[str, Any]) -> Any:
             )
         parts += [
             table,
-            f"{found['seen']:.0%} of the sphere is visible, {found['triangulated']:.0%} of that "
+            f"{found['visible']:.0%} of the sphere is visible, {found['triangulated']:.0%} of that "
             f"triangulated at {found['well_deg']:g}° or more",
         ]
     return Group(*parts, *(f"warning: {w}" for w in data["warnings"]))
