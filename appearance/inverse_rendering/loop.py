@@ -43,7 +43,7 @@ SURE, _DRAWS = 0.975, 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Refused:
+class Rejected:
     """A result that was not taken, with its error."""
 
     maps: HairMaps
@@ -59,7 +59,7 @@ class Outcome:
     start, or why there was nothing to fit; `start_error` and `error` are those of full images of
     all pairs, under the same new random numbers (`FitProblem.full_image_errors`). `sure` is the
     share of bootstrap draws of parts of the hair in which the result is better than the start:
-    below `SURE`, maps and gain are the start's, and `refused` is the result. `history` holds
+    below `SURE`, maps and gain are the start's, and `rejected` is the result. `history` holds
     (seconds, validation error). `left_open`: see `global_parameters.Solved`.
     """
 
@@ -70,7 +70,7 @@ class Outcome:
     error: float
     history: list[tuple[float, float]] = field(default_factory=list)
     sure: float = 1.0
-    refused: Refused | None = None
+    rejected: Rejected | None = None
     left_open: dict[str, float] = field(default_factory=dict)
 
 
@@ -271,7 +271,7 @@ class _Fit:
         start = Outcome(as_begun, self.gain, kept, begun, begun, self.history, sure)
         start = replace(start, left_open=state.left_open)
         if sure < SURE:
-            return replace(start, refused=Refused(maps, gain, errors[best]))
+            return replace(start, rejected=Rejected(maps, gain, errors[best]))
         return replace(start, maps=maps, gain=gain, ended=how, error=errors[best])
 
 

@@ -85,7 +85,7 @@ def fit_maps(
         if options.variant != "original":
             outcome = fit.run(options, one_colour.maps, one_colour.gain, (0.3, 0.9))
             taken = taken or outcome.error < outcome.start_error
-        found = outcome if taken or outcome.refused is None else outcome.refused
+        found = outcome if taken or outcome.rejected is None else outcome.rejected
         judged = Model(model.work("inverse_rendering")).create()
         found.maps.save(judged, mapped.root_uv)
         save_lights(judged, found.gain, problem.lights)
@@ -217,10 +217,10 @@ class _Fit:
         series = Series(f"inverse rendering, {options.variant}", measured)
         series.points = list(outcome.history)
         self.stage.series.append(series)
-        if outcome.refused is not None:
+        if outcome.rejected is not None:
             self.stage.warn(
                 f"{options.variant}: rejected, as the loss of full training images went from "
-                f"{outcome.error:.4f} to {outcome.refused.error:.4f}, lower in {outcome.sure:.0%} "
+                f"{outcome.error:.4f} to {outcome.rejected.error:.4f}, lower in {outcome.sure:.0%} "
                 f"of random draws of parts of the hair ({SURE:.1%} are required)"
             )
         elif outcome.ended != "converged":

@@ -39,7 +39,7 @@ CELLS = 10, 24
 """Rows and columns of a turning map's panels."""
 _FAR = 100.0
 """Metres to these panels."""
-_ASKED = {"first_lights": 24, "deep_lights": 16}
+_SAMPLED = {"first_lights": 24, "deep_lights": 16}
 """Panels sampled at a path's first and later vertices."""
 _PIXELS = 10_000
 """Pixels in memory at once, under every panel."""
@@ -148,8 +148,8 @@ def turning_light(
     for k in range(tiles):
         progress("rendering all directions of light", k / tiles)
         at = slice(k, None, tiles)
-        first: dict[str, Any] = {"pixels": index[at], "spp": more, "max_depth": 1, **_ASKED}
-        rest: dict[str, Any] = {"spp": spp, "max_depth": sampling.max_depth, **_ASKED}
+        first: dict[str, Any] = {"pixels": index[at], "spp": more, "max_depth": 1, **_SAMPLED}
+        rest: dict[str, Any] = {"spp": spp, "max_depth": sampling.max_depth, **_SAMPLED}
         lit = (
             render_olat(scene, camera, panels, seed=4 * seed + 1, **first),
             render_olat(scene, camera, panels, seed=4 * seed + 2, **first),

@@ -86,7 +86,7 @@ def weights_of_environment(
     return weights
 
 
-def stand_ins(lights: Sequence[Light], weights: Array, there: Bools) -> Array:
+def reassigned(lights: Sequence[Light], weights: Array, there: Bools) -> Array:
     """`weights (L, 3)` moved to the lights that are `there (L,)`: each other light's irradiance
     goes to the nearest one with its channels."""
     own, unit = irradiance(lights), np.array([x.position for x in lights])

@@ -117,7 +117,7 @@ class Sight:
 
     `point (3,)` is nearest to all optical axes, `distance (N,)` how far it is from each camera,
     `visible (N,)` whether it is in front of a camera and at most half an image outside of it.
-    `diversity` is 0 for parallel axes, 1 for cameras all around. `astray` is the median angle
+    `diversity` is 0 for parallel axes, 1 for cameras all around. `miss` is the median angle
     between axis and point over that between axis and mean axis: about 1 for random directions.
     """
 
@@ -125,7 +125,7 @@ class Sight:
     distance: Array
     visible: Bools
     diversity: float
-    astray: float
+    miss: float
 
     @property
     def whole(self) -> bool:
@@ -155,8 +155,8 @@ class Sight:
         along = np.einsum("ni,ni->n", axes, point - centers)
         past = np.median(np.abs(np.arctan2(np.sqrt(np.maximum(distance**2 - along**2, 0)), along)))
         diversity = 1 - float(np.linalg.norm(axes.mean(axis=0)))
-        astray = float(past) / max(float(np.arccos(1 - diversity)), 1e-12)
-        return cls(point, distance, np.array(visible), diversity, astray)
+        relative = float(past) / max(float(np.arccos(1 - diversity)), 1e-12)
+        return cls(point, distance, np.array(visible), diversity, relative)
 
 
 def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: str) -> list[str]:
@@ -172,7 +172,7 @@ def check_cameras(cameras: Sequence[Camera], options: PlacementOptions, axes: st
         other = _sight(reading)
         if other is None or not other.whole:
             continue
-        closer = sight.diversity < 0.5 * other.diversity and other.astray < sight.astray
+        closer = sight.diversity < 0.5 * other.diversity and other.miss < sight.miss
         if closer or not sight.whole:
             raise PlacementError(f"the cameras have no common target, but would have one {hint}")
     if not sight.whole:

@@ -18,7 +18,7 @@ from appearance.model.light_sums import (
     LightSums,
     few_lights,
     lights_in_turn,
-    stand_ins,
+    reassigned,
     weights_of_environment,
 )
 from appearance.model.relight import PROCEDURAL
@@ -205,7 +205,7 @@ class Lighting:
         if not sums.names:
             raise BadLight(f"{camera}: the capture has no OLAT frame of this camera")
         there = np.isin([x.name for x in self.lights], sums.names)
-        full = stand_ins(self.lights, self._full(weights), there)
+        full = reassigned(self.lights, self._full(weights), there)
         radiance = sums({self.lights[i].name: full[i] for i in np.flatnonzero(full.any(axis=1))})
         values = np.rint(255 * Exposure(exposure)(radiance)).astype(np.uint8)
         return cv2.imencode(".png", values[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[

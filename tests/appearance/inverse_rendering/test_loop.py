@@ -126,7 +126,7 @@ def test_what_whole_pictures_speak_against_is_not_taken(
     monkeypatch.setattr(loop, "solve_global_parameters", solve)
     found = run(plain, hair[begins], options=original)
     np.testing.assert_allclose(found.maps.sigma_a[0, 0, 0], tufted.truth.sigma_a, rtol=1e-6)
-    assert (found.refused is None) == taken
+    assert (found.rejected is None) == taken
 
 
 @pytest.mark.parametrize(
