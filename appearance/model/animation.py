@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,7 @@ from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.files.durable import writing
 
 SECONDS = 3.0
-"""Of a turn, or a sway."""
-_LAG = 1.5
-"""Phase of a tip behind its root in a sway, radians."""
-_ACROSS = 12.0
-"""Phase between roots, radians per metre."""
+"""Duration of an animation."""
 CELLS = 10, 24
 """Rows and columns of a turning map's panels."""
 _FAR = 100.0
@@ -43,35 +38,6 @@ _SAMPLED = {"first_lights": 24, "deep_lights": 16}
 """Panels sampled at a path's first and later vertices."""
 _PIXELS = 10_000
 """Pixels in memory at once, under every panel."""
-
-
-def sway(strands: Strands, frames: int, degrees: float) -> list[Strands]:
-    """A periodic sequence of poses of hair that swings from side to side.
-
-    Each segment is rotated about y, by up to `degrees` at the tip; lengths stay. Strands may enter
-    the head. Raises `ValueError` for fewer than two frames, or degrees beyond 0 to 45.
-    """
-    if frames < 2:
-        raise ValueError(f"a sway needs at least 2 frames, got {frames}")
-    if not 0 <= degrees <= 45:
-        raise ValueError(f"hair sways by 0 to 45 degrees, got {degrees}")
-    points, first = strands.points.astype(np.float64), strands.offsets[:-1]
-    counts = np.diff(strands.offsets)
-    strand = np.repeat(np.arange(len(counts)), counts)
-    along = (np.arange(len(points)) - first[strand]) / np.maximum(counts[strand] - 1, 1)
-    root = points[first[strand]]
-    steps = np.diff(points, axis=0, prepend=points[:1])
-    poses = []
-    for k in range(frames):
-        phase = 2 * np.pi * k / frames - _LAG * along - _ACROSS * root[:, 0]
-        angle = np.radians(degrees) * along * np.sin(phase)
-        c, s = np.cos(angle), np.sin(angle)
-        turned = np.stack([c * steps[:, 0] - s * steps[:, 2], steps[:, 1]], -1)
-        turned = np.column_stack([turned, s * steps[:, 0] + c * steps[:, 2]])
-        total = np.cumsum(turned, axis=0)
-        moved = root + total - total[first[strand]]
-        poses.append(replace(strands, points=moved.astype(strands.points.dtype)))
-    return poses
 
 
 def moving(

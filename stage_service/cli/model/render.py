@@ -72,12 +72,6 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="animation: the environment turns",
     )
-    moves.add_argument(
-        "--sway",
-        type=float,
-        metavar="DEGREES",
-        help="animation: the hair swings by this angle at the tips",
-    )
     render.add_argument("--frames", type=int, help=f"frames of an animation; default: {FRAMES}")
     render.add_argument("--size", type=int, help="width in pixels, without --camera")
     render.add_argument(
@@ -91,8 +85,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Render MODEL's strands with its fitted appearance (hair maps and estimated lights, if it has
     them), in the pose of its capture or of other --strands. --field interpolation interpolates the
-    hair between captured frames. --turntable, --turning-light, --sway and strands of several poses
-    write a WebP animation with smoothed indirect light.
+    hair between captured frames. --turntable, --turning-light and strands of several poses write a
+    WebP animation with smoothed indirect light.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -132,7 +126,7 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if capture is None and args.field == "interpolation":
         raise ValueError("--field interpolation needs captured frames: give --capture")
     poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
-    moves = args.turntable or args.turning_light or args.sway is not None or len(poses) > 1
+    moves = args.turntable or args.turning_light or len(poses) > 1
     _check_animation(args, len(poses), moves)
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -179,14 +173,14 @@ def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
         what = "an animation" if moves else "a picture"
         raise ValueError(f"--out {args.out}: {what} is {' or '.join(suffixes)}")
     if args.frames is not None and (poses > 1 or not moves):
-        raise ValueError("--frames needs --turntable, --turning-light or --sway")
+        raise ValueError("--frames needs --turntable or --turning-light")
     if not moves:
         return
     if args.field == "interpolation":
         raise ValueError("an animation cannot be combined with --field interpolation")
     turns = args.turntable or args.turning_light
-    if poses and (turns or args.sway is not None):
-        raise ValueError("--strands cannot be combined with --turntable, --turning-light or --sway")
+    if poses and turns:
+        raise ValueError("--strands cannot be combined with --turntable or --turning-light")
     if turns and (args.light or args.camera):
         raise ValueError(
             "--turntable and --turning-light cannot be combined with --light or --camera"
@@ -206,7 +200,6 @@ def _animate(
     """Write the animation; returns its figures."""
     from appearance.model.animation import (
         moving,
-        sway,
         turning_light,
         turntable,
         write_animation,
@@ -218,8 +211,7 @@ def _animate(
         turning = turntable if args.turntable else turning_light
         frames = turning(fitted, maps[0], count, camera.width, sampling, progress)
     else:
-        shown = poses or sway(fitted.strands, count, args.sway)
-        frames = moving(fitted, shown, camera, (lights, maps), sampling, progress)
+        frames = moving(fitted, poses, camera, (lights, maps), sampling, progress)
     write_animation(out, frames)
     return {"frames": len(frames)}
 

@@ -1,4 +1,4 @@
-"""Moving pictures: hair that sways, poses of a file, an animation that a reader opens."""
+"""Animations: turning views and lights, poses of a file, and the written file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from appearance.model.animation import (
     CELLS,
     cell_means,
     moving,
-    sway,
     turning_light,
     turntable,
     write_animation,
@@ -26,27 +25,6 @@ from reconstruction.files.strands import read_poses
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 SKIN = 0.5, 0.35, 0.28
-
-
-def test_a_sway_keeps_roots_and_lengths_and_turns_back(small):
-    strands = small.tuft(40)
-    poses = sway(strands, 8, 20.0)
-    first = strands.offsets[:-1]
-    for pose in poses:
-        np.testing.assert_allclose(pose.points[first], strands.points[first], atol=1e-6)
-        np.testing.assert_allclose(pose.lengths(), strands.lengths(), rtol=1e-3)
-    moved = [np.abs(p.points - strands.points).max() for p in poses]
-    assert max(moved) > 0.05 * strands.lengths().max()
-    steps = [
-        np.abs(a.points - b.points).max() for a, b in zip(poses, poses[1:] + poses[:1], strict=True)
-    ]
-    assert steps[-1] < 1.2 * max(steps[:-1]), "the last pose goes over into the first"
-    still = sway(strands, 8, 0.0)[0]
-    np.testing.assert_allclose(still.points, strands.points, atol=1e-6)
-    with pytest.raises(ValueError, match="at least 2 frames"):
-        sway(strands, 1, 5.0)
-    with pytest.raises(ValueError, match="0 to 45 degrees"):
-        sway(strands, 4, 90.0)
 
 
 def test_poses_of_a_file(small, tmp_path):
@@ -135,7 +113,7 @@ def test_a_ball_under_turning_light_is_as_an_environment_renders_it(small):
 def test_hair_at_rest_does_not_flicker_and_is_lit_as_a_picture_of_it(small):
     model, room = model_of(small), Environment(studio(40))
     camera, few = three_quarter_view(model.strands, 16), Sampling(2, 4)
-    one, other = moving(model, sway(model.strands, 2, 0.0), camera, ((), (room,)), few)
+    one, other = moving(model, [model.strands] * 2, camera, ((), (room,)), few)
     np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3 * one.max())
     picture = environment_smoothed(model.scene(), camera, room.envmap, few)
     np.testing.assert_allclose(one, picture, rtol=1e-3, atol=1e-3 * one.max())
