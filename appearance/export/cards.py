@@ -108,7 +108,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def draw_cards(groom: Groom, cards: Cards, colour: Array) -> Ints:
-    """The cards' strands as an sRGB picture `(H, W, 4)` uint8, root at a tile's top, BGRA."""
+    """The cards' strands as an sRGB image `(H, W, 4)` uint8, root at a tile's top, BGRA."""
     width, height = TILE
     count, k = cards.half.shape
     rows = -(-count // ROW)

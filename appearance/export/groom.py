@@ -93,7 +93,7 @@ class Groom:
 
     @property
     def st(self) -> Floats:
-        """`root_uv (S, 2)` as others have it: t upwards on the pictures of `layer_image`."""
+        """`root_uv (S, 2)` as others have it: t upwards on the images of `layer_image`."""
         return upwards(self.root_uv)
 
     @property
@@ -115,7 +115,7 @@ class Groom:
 
 
 def upwards(uv: Array) -> Floats:
-    """`uv (N, 2)` of pictures whose rows go down, with v that goes up."""
+    """`uv (N, 2)` of images whose rows go down, with v that goes up."""
     return (uv * (1, -1) + (0, 1)).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Hair maps as pictures: an EXR for each layer, and what they are in JSON."""
+"""Hair maps as images: an EXR for each layer, and what they are in JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def export_maps(maps: HairMaps, folder: Path) -> list[Path]:
 
 
 def layer_image(layer: Array) -> Floats:
-    """A layer `(w, h, 1 to 3)` of maps as a picture `(h, w, 3)`: columns u, rows v."""
+    """A layer `(w, h, 1 to 3)` of maps as an image `(h, w, 3)`: columns u, rows v."""
     image = np.zeros((layer.shape[1], layer.shape[0], 3), np.float32)
     image[..., : layer.shape[2]] = layer.transpose(1, 0, 2)
     return image

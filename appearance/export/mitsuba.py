@@ -73,7 +73,7 @@ def export_mitsuba(groom: Groom, folder: Path, view: View) -> list[Path]:
 
 
 def off_by(camera: Camera) -> float:
-    """Pixels that a scene's picture is off from one by `camera`, at most.
+    """Pixels that a scene's image is off from one by `camera`, at most.
 
     Stock Mitsuba has no lens, no skew, and one focal length: the horizontal one.
     """

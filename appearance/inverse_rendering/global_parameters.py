@@ -208,7 +208,7 @@ class _System:
         seen = self.problem.compare(patch, halves.mean(axis=0))
         weight = np.where(seen.valid[..., None], losses.weights(seen.level), 0)
         if self.noise[k].size:
-            # of other paths: weights from this picture's noise would select among it
+            # of other paths: weights from this image's noise would select among it
             weight = losses.noise_weighted(weight, self.noise[k])
         self.noise[k] = (halves[0] - halves[1]) ** 2
         left, right = [], []

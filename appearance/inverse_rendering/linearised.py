@@ -64,9 +64,9 @@ class Cells:
 
 
 class LinearisedPictures:
-    """Pictures `(2, L, P, 3)` of either half of the `paths`, with `maps` on the hair.
+    """Images `(2, L, P, 3)` of either half of the `paths`, with `maps` on the hair.
 
-    `intensities (L, 3)` of the lights are in scene units, pictures in theirs. Derivatives are those
+    `intensities (L, 3)` of the lights are in scene units, images in theirs. Derivatives are those
     by `names`, of `SHARED` and "rotation".
     """
 
@@ -93,7 +93,7 @@ class LinearisedPictures:
         self._first = (at < paths.starts[1])[:, None]
 
     def picture(self) -> Array:
-        """The pictures `(2, L, P, 3)`, of each half of the samples."""
+        """The images `(2, L, P, 3)`, of each half of the samples."""
         return self._film(self._light)
 
     def change(self, moved: Mapping[str, Any], *, first_hit: bool = False) -> Array:

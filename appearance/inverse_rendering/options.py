@@ -13,7 +13,7 @@ Variant = Literal["original", "spatial", "correctives", "lights"]
 
 @options
 class Effort:
-    """The cost of a picture: `pixels` of a view, `spp` paths of at most `max_depth` vertices."""
+    """The cost of an image: `pixels` of a view, `spp` paths of at most `max_depth` vertices."""
 
     pixels: Count = 120
     spp: Count = 32

@@ -145,7 +145,7 @@ class FitProblem:
     def _twice(
         self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int
     ) -> tuple[Comparison, Comparison]:
-        """Two independent pictures beside what was captured."""
+        """Two independent images beside what was captured."""
         one, other = (self.render(raw, gain, patch, effort, seed + k) for k in (0, 1 << 20))
         return self.compare(patch, one), self.compare(patch, other)
 

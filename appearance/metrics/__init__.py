@@ -1,1 +1,1 @@
-"""How well rendered pictures agree with captured ones."""
+"""How well rendered images agree with captured ones."""

@@ -1,7 +1,7 @@
 """LPIPS (Zhang et al. 2018), where the user supplies its weights.
 
 They are not part of this project. The environment variable `HAIRSTAGE_LPIPS` names an ONNX file of
-a network that takes two pictures `in0` and `in1` `(1, 3, H, W)` in [-1, 1], which the authors'
+a network that takes two images `in0` and `in1` `(1, 3, H, W)` in [-1, 1], which the authors'
 package writes in three lines:
 
     import lpips, torch
@@ -24,11 +24,11 @@ from reconstruction.arrays import AnyFloats, Bools, Floats
 VARIABLE = "HAIRSTAGE_LPIPS"
 UNAVAILABLE = f"LPIPS needs network weights: {VARIABLE} names no ONNX file"
 _LEAST = 64
-"""Pixels on a side: smaller pictures are enlarged, as AlexNet would have nothing left of them."""
+"""Pixels on a side: smaller images are enlarged for AlexNet."""
 
 
 def lpips(image: AnyFloats, truth: AnyFloats, mask: Bools) -> float | None:
-    """Distance of two pictures `(H, W, 3)` with values in [0, 1], both black outside `mask (H, W)`.
+    """Distance of two images `(H, W, 3)` with values in [0, 1], both black outside `mask (H, W)`.
 
     None where no weights are given; `ValueError` where the file is not such a network.
     """
@@ -42,7 +42,7 @@ def lpips(image: AnyFloats, truth: AnyFloats, mask: Bools) -> float | None:
         return float(np.mean(network.forward()))
     except cv2.error as error:
         raise ValueError(
-            f"{VARIABLE}={file} is not an ONNX network of two pictures in0 and in1: {error.err}"
+            f"{VARIABLE}={file} is not an ONNX network of two images in0 and in1: {error.err}"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Pictures for people: captured beside rendered."""
+"""Comparisons of captured and rendered images."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Row = tuple[str, Mapping[str, AnyFloats], Mapping[str, str]]
 
 
 def small(picture: AnyFloats) -> Floats:
-    """Picture values `(H, W, 3)` as large as a comparison shows them: whole frames fill memory."""
+    """Image values `(H, W, 3)` reduced to the size of a comparison."""
     return block_means(picture, -(-max(picture.shape[:2]) // LARGEST))
 
 
 def comparison_picture(
     path: Path, rows: Sequence[Row], columns: Sequence[str], *, height: float = 2.6
 ) -> None:
-    """Write a PNG of `rows` (label, picture values `(H, W, 3)` by column, captions by column)."""
+    """Write a PNG of `rows` (label, image values `(H, W, 3)` by column, captions by column)."""
     # the object interface: pyplot keeps figures alive and wants a display
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -58,7 +58,7 @@ def comparison_picture(
 
 
 def write_png(path: Path, picture: AnyFloats) -> None:
-    """Write picture values `(H, W, 3)` in [0, 1] as an 8-bit PNG."""
+    """Write image values `(H, W, 3)` in [0, 1] as an 8-bit PNG."""
     values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
     if not cv2.imwrite(str(path), values[..., ::-1]):
         raise OSError(f"{path} cannot be written")

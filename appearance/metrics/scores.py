@@ -47,12 +47,12 @@ class Exposure:
         return cls.of([lit]) if len(lit) else cls(1.0)
 
     def __call__(self, radiance: ArrayLike) -> Array:
-        """Picture values in [0, 1] of `radiance`, any shape."""
+        """Image values in [0, 1] of `radiance`, any shape."""
         return srgb(np.asarray(radiance, float) * self.scale)
 
 
 def scores(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> dict[str, float]:
-    """ "psnr" and "ssim" of pictures `(H, W, 3)`, and "lpips" where its weights are given."""
+    """ "psnr" and "ssim" of images `(H, W, 3)`, and "lpips" where its weights are given."""
     image, truth, mask = _checked(image, truth, mask)
     out = {"psnr": psnr(image, truth, mask), "ssim": ssim(image, truth, mask)}
     distance = lpips.lpips(image, truth, mask)
@@ -72,7 +72,7 @@ def scores_unavailable() -> dict[str, str]:
 def psnr(image: AnyFloats, truth: AnyFloats, mask: Bools | None = None) -> float:
     """Peak signal-to-noise ratio in dB for range 1, over the pixels of `mask (H, W)`.
 
-    Both images are `(H, W, 3)` picture values. Equal images give 100 dB, a number JSON can hold.
+    Both images are `(H, W, 3)` image values. Equal images give 100 dB, a number JSON can hold.
     """
     image, truth, mask = _checked(image, truth, mask)
     error = float(np.mean((image[mask] - truth[mask]) ** 2))

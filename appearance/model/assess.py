@@ -260,7 +260,7 @@ class _Comparison:
                 image.frames["nearest_cameras"] = view(light)
 
     def _rows(self, group: str, images: Sequence[_Compared], exposure: Exposure) -> list[Row]:
-        """`SHOWN` rows of a group for the picture, with their scores."""
+        """`SHOWN` rows of a group for the image, with their scores."""
         middle = self.fitted.strands.points.mean(axis=0).astype(float)
         by_camera: dict[str, list[_Compared]] = {}
         for image in images:

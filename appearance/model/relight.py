@@ -1,4 +1,4 @@
-"""A fitted model under another light: the relit picture."""
+"""A fitted model under another light: the relit image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reconstruction import Camera, Model, Strands, write_exr
 from reconstruction.arrays import AnyFloats, Array, Floats
 
 MARGIN = 1.02
-"""Times what long hair fills of a picture."""
+"""Margin around long hair."""
 LEAST = 1e-3
 """Least radius of the view, metres, for strands in one place."""
 PROCEDURAL = {"studio": studio, "sky": sky}

@@ -28,7 +28,7 @@ def coverage(scene: HairScene, camera: Camera, spp: int = 16, seed: int = 0) -> 
 def pixel_coverage(
     scene: HairScene, camera: Camera, pixels: ArrayLike, spp: int = 16, seed: int = 0
 ) -> dict[str, Floats]:
-    """`coverage` of some pixels, flat indices `(P,)`: two of `(P,)`, however large the picture."""
+    """`coverage` of some pixels, flat indices `(P,)`: two of `(P,)`, however large the image."""
     if spp < 1:
         raise ValueError(f"spp must be positive, got {spp}")
     index = pixel_indices(camera, pixels)

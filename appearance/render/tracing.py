@@ -40,14 +40,14 @@ class PathLimits:
 
 @options
 class Sampling:
-    """Paths a pixel, vertices a path at most, and the seed of a picture."""
+    """Paths a pixel, vertices a path at most, and the seed of an image."""
 
     spp: Count = 64
     max_depth: Count = 24
     seed: int = 0
 
     def plan(self) -> PathPlan:
-        """The paths of a picture in one piece."""
+        """The paths of an image in one piece."""
         return PathPlan(self.spp, (self.seed,), PathLimits(self.max_depth))
 
 
