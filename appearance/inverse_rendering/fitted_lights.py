@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from reconstruction import Light, Model, ModelError
 from reconstruction.arrays import Array
@@ -29,18 +28,10 @@ def fitted_lights(model: Model, lights: Sequence[Light]) -> list[Light]:
     if not model.has(LIGHTS_FILE):
         return list(lights)
     try:
-        rows = {row["name"]: row for row in model.json(LIGHTS_FILE)}
-        return [_as_found(light, rows.get(light.name)) for light in lights]
+        gains = {row["name"]: float(row["gain"]) for row in model.json(LIGHTS_FILE)}
+        return [replace(x, intensity=x.intensity * gains.get(x.name, 1.0)) for x in lights]
     except ModelError:
         raise
     except (KeyError, TypeError, ValueError) as error:
         path = model.file(LIGHTS_FILE)
         raise ModelError(f"{path}: {error!r}: run 'hairstage fit' again") from error
-
-
-def _as_found(light: Light, row: Mapping[str, Any] | None) -> Light:
-    if row is None:
-        return light
-    # 0.1 wrote a second factor, shared by the lights of one profile
-    factor = float(row["gain"]) * float(row.get("profile_scale", 1.0))
-    return replace(light, intensity=light.intensity * factor)
