@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
+from waiting import until
 
 from stage_service.config import (
     LightBankConfig,
@@ -159,16 +160,18 @@ def test_the_thread_puts_lamps_off_by_itself():
 
 def test_a_budget_that_ends_sooner_wakes_the_thread_sooner():
     bank, clock = Bank(), Clock()
-    limits = SafetyLimits(max_on_s=60.0, max_duty=0.5, duty_window_s=10.0)
+    limits = SafetyLimits(max_on_s=60.0, max_duty=0.5, duty_window_s=100.0)
     lights = LimitedLightBank(bank, limits, clock)
-    lights.select(0)  # the thread now sleeps for the five seconds of the budget
-    clock.now += 4.99
+    lights.select(0)
+    clock.now += 49.99
     lights.off()
+    with lights._changed:
+        lights._changed.notify_all()
+    until(lambda: lights._wakes > clock.now + 50.0)  # nothing is lit: the thread sleeps for long
     bank.was_put_off.clear()
-    lights.select(0)  # hardly anything of it is left: the thread must look again
+    lights.select(0)  # hardly anything of the budget is left: the thread must look again
     clock.now += 0.02
-    lights.select(1)
-    lights.off()
+    assert bank.was_put_off.wait(20.0)
     lights.close()
     assert bank.lit == set()
 
