@@ -218,7 +218,9 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
         "Said to be dark", "said to be dark", "no lamp is lit, as a person who looked reports"
     )
     page.keyboard.press("F9")
-    assert "A blackout cannot find out" in told("Off was sent, not read back", "off was sent", sent)
+    assert "A blackout cannot verify it" in told(
+        "Off was sent, not read back", "off was sent", sent
+    )
 
 
 def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
@@ -309,7 +311,7 @@ def test_what_was_shot_at_last_is_missing_no_more(console):
     page.click("button:text-is('Shoot what is missing')")
     page.wait_for_selector(".said:has-text('is complete')")
     assert http.service.captures(1)[0].frames_missing == 0
-    assert page.text_content(".missing") == "none"
+    page.wait_for_selector(".missing:text-is('none')")
 
 
 def test_what_waits_is_put_elsewhere(console):
