@@ -311,7 +311,7 @@ def test_what_was_shot_at_last_is_missing_no_more(console):
     page.click("button:text-is('Shoot what is missing')")
     page.wait_for_selector(".said:has-text('is complete')")
     assert http.service.captures(1)[0].frames_missing == 0
-    page.wait_for_selector(".missing:text-is('none')")
+    page.wait_for_selector(".missing li:text-is('none')")
 
 
 def test_what_waits_is_put_elsewhere(console):
