@@ -17,6 +17,7 @@ BENCHMARKS = {
     "appearance": "inverse rendering and its ablations on subjects of known appearance",
     "backends": "BSDF, OLAT, inverse rendering and line stereo on CPU and GPU: seconds, agreement",
     "bsdf": "our hair BSDF compared with Mitsuba's: tables and images",
+    "callers": "load x caller x fault: seconds to a blackout, how much slower a capture is",
     "demo": "recorded demos over subjects and seeds compared with their baselines",
     "exports": "a model opened, rendered and written by Blender, compared with ours",
     "fields": "fields of reflectance compared with baselines on new lights and views",

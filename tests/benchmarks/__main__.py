@@ -26,6 +26,7 @@ MODULES = {
     "appearance": "benchmarks.appearance.ablations",
     "backends": "benchmarks.backends.side_by_side",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
+    "callers": "benchmarks.service.callers",
     "demo": "benchmarks.demo",
     "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",

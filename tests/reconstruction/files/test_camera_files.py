@@ -254,7 +254,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     (binary / "images.bin").write_bytes(whole[:-20])
     refused(r"images\.bin: ends at byte .* is truncated", binary)
     (binary / "images.bin").write_bytes(whole[:83] + b"\xff" * 8 + whole[91:])
-    refused(r"images\.bin: .*cut off", binary)
+    refused(r"images\.bin: .*truncated", binary)
     transforms = tmp_path / "transforms.json"
     writers.write_transforms(transforms, stage())
     data = json.loads(transforms.read_text())
