@@ -27,17 +27,17 @@ from stage_service.viewer.operations import Source
 from stage_service.viewer.viewed import BadLight, NothingToView
 
 MOST_BYTES = 1 << 30
-"""Of one answer: a model's strands and seen lights have a hundredth of it."""
-START_S, ANSWER_S, END_S = 60.0, 600.0, 5.0
-"""Until it has begun; until an answer is given up; until it has ended, before it is killed."""
+"""Of one reply: a model's strands and visibility have a hundredth of it."""
+START_S, REPLY_S, END_S = 60.0, 600.0, 5.0
+"""Deadlines of its start, of a reply, and of its end before it is killed."""
 LOOK_S = 0.02
-"""How often it is looked at, while somebody waits, whether a capture is shot."""
+"""Period of the check, during a call, whether a capture is running."""
 STOPPED_S = 10.0
-"""Who waits for it longer than this while it stands still is refused."""
+"""A call that waits longer than this for the stopped process is refused."""
 KINDS: dict[str, type[Exception]] = {
     kind.__name__: kind for kind in (NothingToView, BadLight, ModelError, CaptureError)
 }
-"""Errors that an answer may name; any other is a fault."""
+"""Errors that a reply may name; any other is a fault."""
 
 
 class TracerStopped(RuntimeError):
@@ -72,14 +72,14 @@ class Tracer:
         with self._call(yields) as connection:
             try:
                 framing.send(connection, request)
-                head, parts = framing.receive(connection, MOST_BYTES, time.monotonic() + ANSWER_S)
+                head, parts = framing.receive(connection, MOST_BYTES, time.monotonic() + REPLY_S)
             except (OSError, EOFError, ValueError) as error:
                 if yields and self._shooting():
                     raise TracerStopped(
                         "a capture is being shot: light is traced when it is over; try again then"
                     ) from None
                 raise TracerStopped(
-                    f"the process that views models gave no answer ({type(error).__name__}): try "
+                    f"the process that views models sent no reply ({type(error).__name__}): try "
                     "again; where that does not help, the model may need more memory than there is"
                 ) from error
         if (kind := head.get("kind")) is not None:

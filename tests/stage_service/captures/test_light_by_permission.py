@@ -332,6 +332,7 @@ class Stage(RuleBasedStateMachine):
         if result is None:
             with self.rights.lock:
                 self.rights.left[wanted.lamp] = 0
+                self.rights.armed.pop(wanted.lamp, None)
                 assert self.rights.made[wanted.lamp] == before, (
                     "it was refused, and lit all the same"
                 )
