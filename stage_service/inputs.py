@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from appearance.model.relight import PROCEDURAL
+from appearance.render.environment_maps import PROCEDURAL
 from reconstruction import Mesh, Rig
 from reconstruction.arrays import Bools
 from reconstruction.containment import plain_file

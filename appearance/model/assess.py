@@ -23,8 +23,9 @@ from appearance.model.baselines import NearestCameras, other_lights, three_neare
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import environment_map, relight
+from appearance.model.relight import relight
 from appearance.observations import HeldOut, Observed, observe_hair
+from appearance.render.environment_maps import environment_map
 from appearance.render.mixed import Environment
 from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from appearance.metrics.pictures import write_png
 from appearance.metrics.scores import Exposure
 from appearance.model.fitted_model import FittedModel
 from appearance.render.coverage import coverage
-from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.smoothed import SHOWN, environment_smoothed
 from reconstruction import Camera, Model, Strands, write_exr
 from reconstruction.arrays import AnyFloats, Array, Floats
@@ -20,12 +18,6 @@ MARGIN = 1.02
 """Margin around long hair."""
 LEAST = 1e-3
 """Least radius of the view, metres, for strands in one place."""
-PROCEDURAL = {"studio": studio, "sky": sky}
-
-
-def environment_map(name: str) -> Floats:
-    """The map `(H, W, 3)` "studio" or "sky", or that of an `.hdr` or `.exr` file."""
-    return PROCEDURAL[name]() if name in PROCEDURAL else load_environment(Path(name))
 
 
 def relight(

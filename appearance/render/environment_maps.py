@@ -128,3 +128,11 @@ def _soft_box(
         for half, off in zip(half_deg, (across, along), strict=True)
     )
     return (edge_x * edge_y).astype(np.float32)
+
+
+PROCEDURAL = {"studio": studio, "sky": sky}
+
+
+def environment_map(name: str) -> Floats:
+    """The map `(H, W, 3)` "studio" or "sky", or that of an `.hdr` or `.exr` file."""
+    return PROCEDURAL[name]() if name in PROCEDURAL else load_environment(Path(name))

@@ -173,7 +173,7 @@ def hold_out(rig: Rig, camera: str | None = None) -> dict[str, list[str]]:
 
 def _check(args: argparse.Namespace) -> None:
     """Check the arguments before an earlier demo is removed; make their paths absolute."""
-    from appearance.model.relight import PROCEDURAL, environment_map
+    from appearance.render.environment_maps import PROCEDURAL, environment_map
     from reconstruction import read_obj, read_strands
 
     if args.seed < 0:

@@ -21,7 +21,7 @@ from appearance.model.light_sums import (
     reassigned,
     weights_of_environment,
 )
-from appearance.model.relight import PROCEDURAL
+from appearance.render.environment_maps import PROCEDURAL
 from appearance.render.visibility import above_faces, reached, within_fibres
 from reconstruction import Camera, Capture, Light, Model
 from reconstruction.arrays import Array

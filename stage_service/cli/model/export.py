@@ -156,7 +156,8 @@ def _write(
 
         return export_maps(groom.maps, out)
     from appearance.export.mitsuba import View, export_mitsuba, off_by
-    from appearance.model.relight import environment_map, three_quarter_view
+    from appearance.model.relight import three_quarter_view
+    from appearance.render.environment_maps import environment_map
 
     if capture is None or args.camera is None:
         camera = three_quarter_view(groom.strands, SIZE)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     the same and --options is not given. Held-out cameras and lights are used to score the model.
     """
     from appearance import HeldOut
-    from appearance.model.relight import environment_map
+    from appearance.render.environment_maps import environment_map
     from appearance.sun_fit.fitted_appearance import FittedAppearance
     from reconstruction import Model, parse_options
     from stage_service.jobs.records import JobOptions

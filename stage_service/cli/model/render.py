@@ -98,7 +98,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
 def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Render the image or animation; returns its path and figures."""
     from appearance import Environment, FittedModel, Sampling
-    from appearance.model.relight import environment_map, three_quarter_view
+    from appearance.model.relight import three_quarter_view
+    from appearance.render.environment_maps import environment_map
     from reconstruction import Capture, Model
     from reconstruction.files.durable import writing
     from reconstruction.files.strands import read_poses

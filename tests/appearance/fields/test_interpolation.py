@@ -153,6 +153,7 @@ def test_search_warns_where_standard_interpolation_is_as_good(planted):
     assert any("standard interpolation" in w for w in stage.warnings)
 
 
+@pytest.mark.slow
 def test_search_is_judged_by_frames_that_are_there(planted):
     """A frame that did not come is no picture without an error: other cameras' frames say."""
     whole = replace(planted, sources=planted.sources[:2])

@@ -32,7 +32,7 @@ def solve(problem: FitProblem, hair: HairAppearance, names=COLOUR, effort: Effor
     "start",
     [
         HairAppearance((0.2, 0.2, 0.2), 0.4, 0.2, eta=1.45),
-        HairAppearance((0.2, 0.2, 0.2), 0.9, 0.9),
+        pytest.param(HairAppearance((0.2, 0.2, 0.2), 0.9, 0.9), marks=pytest.mark.slow),
     ],
     ids=["near", "far"],
 )
@@ -74,7 +74,11 @@ def test_white_hair(tufted):
 
 @pytest.mark.parametrize(
     ("begins", "names", "off", "left"),
-    [(0.2, COLOUR, 0.2, 0.04), (3.0, COLOUR, 0.05, 0.01), (3.0, COLOUR[:3], 0, 0.01)],
+    [
+        pytest.param(0.2, COLOUR, 0.2, 0.04, marks=pytest.mark.slow),
+        (3.0, COLOUR, 0.05, 0.01),
+        (3.0, COLOUR[:3], 0, 0.01),
+    ],
 )
 def test_black_hair(tufted, begins, names, off, left):
     """Its highlight tells roughness and index. Of its absorption it tells that it is black."""

@@ -166,6 +166,7 @@ def test_a_fit_that_is_not_taken_leaves_suns_to_be_rendered(made, tmp_path, monk
     assert warning.startswith("original: rejected")
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_stopped_leaves_what_was_rendered_and_one_that_ends_replaces_it(
     made, tufted, tmp_path, monkeypatch
 ):

@@ -16,8 +16,9 @@ from appearance.model.baselines import NearestCameras, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import environment_map, relight, three_quarter_view
+from appearance.model.relight import relight, three_quarter_view
 from appearance.render.coverage import coverage
+from appearance.render.environment_maps import environment_map
 from appearance.render.smoothed import olat_smoothed, smoothed, without_rare
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
@@ -96,6 +97,7 @@ def result(made):
     return assess(capture, model, held_out=HELD_OUT, options=OPTIONS)
 
 
+@pytest.mark.slow
 def test_the_true_model_beats_the_trivial_baselines(result):
     for group in ("held_out_lights", "held_out_camera"):
         rows = result[group]
@@ -111,6 +113,7 @@ def test_the_true_model_beats_the_trivial_baselines(result):
     assert "HAIRSTAGE_LPIPS" in result["lpips"]
 
 
+@pytest.mark.slow
 def test_pictures_and_report_are_left_in_the_model(made, result):
     _, model, _ = made
     stage = model.report()["images"]
@@ -299,6 +302,7 @@ def guided(made):
     return GuidedFrames(scene, fitted, HELD_OUT.training(capture), camera, mask)
 
 
+@pytest.mark.slow
 def test_frames_changed_by_the_true_model_are_nearer_than_unchanged_ones(result):
     rows = result["held_out_lights"]
     assert rows["guided_frames"]["psnr"] > rows["three_nearest"]["psnr"] + 1

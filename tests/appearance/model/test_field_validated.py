@@ -99,6 +99,7 @@ def kept(made, tmp_path_factory):
     return copy, result, shares
 
 
+@pytest.mark.slow
 def test_a_field_that_helps_is_in_every_picture_of_the_model(made, kept):
     capture, (model, result, shares) = made[0], kept
     assert shares == sorted(shares)
@@ -121,6 +122,7 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(made, kept):
     assert FittedModel.load(model, capture, with_field=False).field is None
 
 
+@pytest.mark.slow
 def test_edited_hair_keeps_its_field(made, kept, tmp_path):
     capture, model = made[0], Model(tmp_path / "model")
     shutil.copytree(kept[0].path, model.path)

@@ -283,6 +283,7 @@ def test_bad_arguments_are_refused(tufted, wrong):
         render_olat(scene, camera, lights, **wrong)
 
 
+@pytest.mark.slow
 def test_agrees_with_blender_cycles(shared_data, small):
     """Another renderer's capture: mean radiance over the subject, by channel and by light."""
     folder = shared_data("captures/cycles_wavy")

@@ -19,8 +19,8 @@ from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.pictures import Pictures
 from appearance.fields.validation import GROUPS, gains, spread_of
 from appearance.metrics.scores import srgb
-from appearance.model.relight import environment_map
 from appearance.render.coverage import coverage
+from appearance.render.environment_maps import environment_map
 from appearance.render.olat import render_indirect, render_olat
 from appearance.render.smoothed import smoothed
 from benchmarks.appearance.known_subjects import SmallStage, bent, dome, dyed, ring

@@ -44,6 +44,7 @@ def test_the_bsdf_is_the_same_on_a_gpu() -> None:
     assert compared(one, other)["rms"] < 1e-5
 
 
+@pytest.mark.slow
 def test_a_quick_run_leaves_what_the_cpu_does_and_says_what_is_not_here(tmp_path, capsys) -> None:
     assert main(["backends", "--quick", "--jobs", "bsdf", "--out", str(tmp_path)]) == 0
     (job,) = json.loads((tmp_path / "backends.json").read_text())["jobs"].values()

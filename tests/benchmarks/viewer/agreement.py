@@ -15,9 +15,9 @@ import numpy as np
 
 from appearance import Exposure, HairScene, Sampling, psnr, render_environment, render_olat
 from appearance.model.light_sums import weights_of_environment
-from appearance.model.relight import environment_map
 from appearance.render.coverage import coverage
 from appearance.render.environment import direct_environment
+from appearance.render.environment_maps import environment_map
 from benchmarks.viewer.page import Shown
 from reconstruction import Camera, Light, Progress
 from reconstruction.arrays import Array, Bools, Floats

@@ -232,12 +232,12 @@ def test_dmx_faults_are_told(bench, kind):
 
 @pytest.mark.parametrize("widget", ["by Enttec", "that ignores what user data it is asked for"])
 def test_a_late_dmx_answer_is_not_taken_for_the_next_one_s(bench, widget, monkeypatch):
-    carry_out = DmxWidget._carry_out
+    execute = DmxWidget._execute
     if widget != "by Enttec":
         monkeypatch.setattr(
             DmxWidget,
-            "_carry_out",
-            lambda self, label, data: carry_out(self, label, b"\0\0" if label == 3 else data),
+            "_execute",
+            lambda self, label, data: execute(self, label, b"\0\0" if label == 3 else data),
         )
     late = Fault("lights", "late", 1, request="3", seconds=LATE_S)
     never = Fault("lights", "silent", 1, request="3")

@@ -104,7 +104,7 @@ def test_devices_whose_names_are_no_file_names(capture, name):
     assert not is_file_name(name)
     rig = capture / "rig.json"
     rig.write_text(rig.read_text().replace('"cam_0"', json.dumps(name)))
-    with pytest.raises((RigError, CaptureError), match=r"is no name|has NUL"):
+    with pytest.raises((RigError, CaptureError), match=r"cannot be a name|has NUL"):
         Capture(capture)
 
 

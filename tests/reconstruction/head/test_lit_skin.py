@@ -192,6 +192,7 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
     assert not (tmp_path / "head.obj").exists()
 
 
+@pytest.mark.slow
 def test_few_lights_or_little_skin_tell_nothing(head: Mesh) -> None:
     few = Shaded(head, around(120), LIGHTS[:20])
     masked = MaskedCapture(few, few.masks)

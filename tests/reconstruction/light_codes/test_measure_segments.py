@@ -69,6 +69,7 @@ def test_the_baseline_runs_on_the_same_capture(shot: Capture, fibres: Any, tmp_p
     assert figures["all"]["3mm_30deg"]["f"] > 0.5
 
 
+@pytest.mark.slow
 def test_no_light_beside_a_camera_is_said(
     make_fibres: Any, fibre_lamps: Any, fibre_cameras: Any, tmp_path: Path
 ) -> None:

@@ -154,6 +154,7 @@ def test_a_subject_that_moves_by_more_than_its_detail_is_followed(
     assert pose_error(motion, poses).max() < 2 * pixel
 
 
+@pytest.mark.slow
 def test_compensation_brings_the_points_back(moving: Capture) -> None:
     first = triangulate(moving)
     motion = solve_motion(moving, first, options=MotionOptions(between="hold"))

@@ -60,7 +60,7 @@ def test_it_says_what_this_process_would(model, tracing):
     ):
         here = OPERATIONS[operation](viewed, **options)
         assert tracing.do(source, operation, options, yields=True) == here, operation
-    with pytest.raises(NothingToView, match="no light number 999"):
+    with pytest.raises(NothingToView, match="light number 999"):
         tracing.do(source, "visibility", {"light": 999}, yields=True)
     with pytest.raises(RuntimeError, match="KeyError"):
         tracing.do(source, "none of them", {}, yields=True)
