@@ -194,16 +194,16 @@ class CaptureQueue(Background):
             self._changed.notify_all()
 
     def _run(self) -> None:
+        late = 0.0
         while True:
+            late = max(late, self._wait(lambda: self._closed or self._unsaved))
             with self._changed:
-                began = boot_seconds()
-                self._changed.wait_for(lambda: self._closed or self._unsaved, POLL_S)
-                late = boot_seconds() - began - POLL_S
                 if self._closed and not self._unsaved:
                     return
                 closed = self._closed
             if late > STOOD_STILL_S:
                 self._hold.set(f"the service stood still for {late:.0f} s")
+            late = 0.0
             if (jump := self._clock.jump()) is not None:
                 why = "it was set, or the machine slept"
                 self._hold.set(f"the clock jumped by {jump:+.0f} s: {why}")
@@ -216,8 +216,14 @@ class CaptureQueue(Background):
                 log.exception("%s", self._path)
                 if closed:
                     return
-                with self._changed:
-                    self._changed.wait_for(lambda: self._closed, POLL_S)
+                late = self._wait(lambda: self._closed)
+
+    def _wait(self, until: Callable[[], bool]) -> float:
+        """Wait for up to `POLL_S`; returns by how many seconds it took longer than that."""
+        with self._changed:
+            began = boot_seconds()
+            self._changed.wait_for(until, POLL_S)
+            return boot_seconds() - began - POLL_S
 
     def _begin_the_next(self) -> None:
         with self._beginning:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+import threading
 
+import pytest
+from waiting import until
+
+from stage_service.captures import capture_queue
+from stage_service.captures.capture_queue import CaptureQueue
 from stage_service.captures.hold import MOST_REASONS, Hold, HoldChanged
 from stage_service.records.events import EventLog
 
@@ -56,3 +61,31 @@ def test_the_newest_reasons_are_kept_and_can_be_sent(hold):
     assert len(hold.current.reasons) == MOST_REASONS
     assert hold.current.reasons[0].why.startswith("abort 14")
     assert hold.current.text.encode().startswith(b"abort 14 of ")
+
+
+def test_a_standstill_while_the_disk_is_full_holds_the_queue(tmp_path, monkeypatch):
+    """The queue's thread then pauses between two attempts to save; the process is stopped there."""
+    hold, boot, failed = Hold(EventLog()), [100.0], threading.Event()
+    hold.release(hold.current.id)
+
+    class Stopped(threading.Condition):
+        def wait_for(self, *args):
+            if failed.is_set() and boot[0] == 100.0:
+                boot[0] += 60.0
+            return super().wait_for(*args)
+
+    def full(self):
+        failed.set()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(capture_queue, "boot_seconds", lambda: boot[0])
+    monkeypatch.setattr(capture_queue, "POLL_S", 0.01)
+    monkeypatch.setattr(CaptureQueue, "_save", full)
+    queue = CaptureQueue(tmp_path / "queue.json", EventLog(), lambda _: "", lambda: None, hold)
+    queue._changed, queue._unsaved = Stopped(), True
+    queue.start({}, set(), None)
+    try:
+        until(lambda: hold.current)
+    finally:
+        queue.close()
+    assert hold.current.text.startswith("the service stood still for 60 s")
