@@ -179,9 +179,8 @@ def _renders(crowd: Crowd) -> None:
     """Eight viewers that have light traced."""
     weights = {str(n): [1, 1, 1] for n in range(0, 60, 3)}
     view = json.dumps({"view": VIEW, "weights": weights}).encode()
-    path = f"POST /view/models/{crowd.model}/indirect"
-    light = json.dumps({"weights": weights}).encode()
-    crowd.asked([crowd.request(f"{path}/view", view), crowd.request(path, light)], workers=8)
+    path = f"POST /view/models/{crowd.model}/indirect/view"
+    crowd.asked([crowd.request(path, view)], workers=8)
 
 
 def _requests(crowd: Crowd) -> None:
