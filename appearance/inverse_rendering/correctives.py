@@ -28,7 +28,7 @@ PRIOR_WEIGHT = 1e-3
 """Weight of half the mean squared corrective, in widths."""
 _TURNS, _ITERATIONS = 2, 30
 _APART = 4
-"""Every so many lights are validation lights."""
+"""One light of this many is a validation light."""
 _SHARES = (2.0, 1.0, 0.5)
 """Step sizes; noise in the derivatives makes steps too short."""
 _ALIKE = 1e-4

@@ -77,7 +77,9 @@ class Rig:
             text = plain_file(path).read_bytes()
             data = parse_json(text) if path.suffix == ".json" else tomllib.loads(text.decode())
         except FileNotFoundError:
-            raise RigError(f"{path}: no such rig file") from None
+            raise RigError(
+                f"{path}: no such rig file; give the path of a .toml or .json file"
+            ) from None
         except ValueError as error:
             raise RigError(f"{path}: {error}") from error
         if not isinstance(data, dict):

@@ -32,8 +32,8 @@ HEADER = (
 
 
 @pytest.fixture(scope="session")
-def told() -> Iterator[Callable[[str, str, str, int, str | None], None]]:
-    """`told(fault, stepping, outcome, missing, error)` adds a row to the table."""
+def add_row() -> Iterator[Callable[[str, str, str, int, str | None], None]]:
+    """`add_row(fault, stepping, outcome, missing, error)`, to the table of faults."""
     rows: list[str] = []
 
     def add(fault: str, stepping: str, outcome: str, missing: int, error: str | None) -> None:
@@ -48,10 +48,10 @@ def told() -> Iterator[Callable[[str, str, str, int, str | None], None]]:
 
 
 class Process:
-    """`hairstage serve` or `worker` in a process of its own; `told` is what it has logged."""
+    """`hairstage serve` or `worker` in a process of its own; `log` is its standard error."""
 
     def __init__(self, stack: ExitStack, log: Path, *words: object, **environment: str) -> None:
-        self._log = log
+        self._log_file = log
         path = {"PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}"}
         with log.open("w") as stderr:
             self.process = subprocess.Popen(
@@ -64,28 +64,28 @@ class Process:
         stack.callback(self._kill)
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        assert line, self.told
+        assert line, self.log
         self.ready = json.loads(line)
 
     @property
-    def told(self) -> str:
-        return self._log.read_text()
+    def log(self) -> str:
+        return self._log_file.read_text()
 
     def stop(self) -> None:
         self.process.send_signal(signal.SIGTERM)
 
-    def ended(self, code: int | None, *told: str) -> None:
-        """It ends within what a stop takes at most, with this exit status (None: 0 or 1) and
-        these words last.
+    def ended(self, code: int | None, *logged: str) -> None:
+        """It ends within the deadline of a stop, with this exit status (None: 0 or 1), and its log
+        matches these patterns.
 
-        A machine on which it cannot even say that leaves the end to the kernel.
+        On a busy machine the service's own alarm (SIGALRM) may end it first.
         """
         found = self.process.wait(STOP_S + 3.0 * machine_slack())
         if found == -signal.SIGALRM and machine_slack() > 2:
             return
-        assert found in ((0, 1) if code is None else (code,)), self.told
-        for text in told:
-            assert re.search(text, self.told), self.told
+        assert found in ((0, 1) if code is None else (code,)), self.log
+        for text in logged:
+            assert re.search(text, self.log), self.log
 
     def _kill(self) -> None:
         self.process.kill()

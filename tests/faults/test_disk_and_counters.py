@@ -20,7 +20,7 @@ STEPPING = pytest.mark.parametrize("stepping", ["software", "hardware"])
 
 
 @STEPPING
-def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monkeypatch):
+def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, add_row, monkeypatch):
     """65535 frames take long: a camera that wraps at 21, and a driver that knows it."""
     monkeypatch.setattr(stage_service.devices.cameras.link, "BLOCK_WRAP", 21)
     monkeypatch.setattr(simulators.world, "BLOCK_IDS", 21)
@@ -34,11 +34,11 @@ def test_wrapped_block_ids(stepping, simulated, small_rig, tmp_path, told, monke
     assert verify(tmp_path / "c") == []
     assert world.pulses == len(plan.steps) > 2 * 21
     assert max(r.block_id for r in writer.records.values()) == 21
-    told("camera: wrapped block ids", stepping, "completed", 0, None)
+    add_row("camera: wrapped block ids", stepping, "completed", 0, None)
 
 
 @STEPPING
-def test_a_full_disk(stepping, simulated, tmp_path, told):
+def test_a_full_disk(stepping, simulated, tmp_path, add_row):
     rig_file, world = simulated()
     plan = resolve(CapturePlan(stepping=stepping), rig_file)
     writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
@@ -62,7 +62,7 @@ def test_a_full_disk(stepping, simulated, tmp_path, told):
     (outcome, never) = verify(tmp_path / "c")
     assert "outcome is 'failed'" in outcome
     assert "never captured" in never
-    told("disk: no room left", stepping, "failed", 0, run.error)
+    add_row("disk: no room left", stepping, "failed", 0, run.error)
 
     again = CaptureWriter.reopen(tmp_path / "c")
     run = Sequencer(DeviceSet.of(rig_file), again, plan, permission=Permission.granted("a test"))

@@ -27,7 +27,7 @@ PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
 
 
 @pytest.mark.parametrize(("name", "place", "call", "stepping"), PLACES, ids=[p[0] for p in PLACES])
-def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, tmp_path, told):
+def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, tmp_path, add_row):
     rig_file, world = simulated()
     plan = CapturePlan(**PLAN, stepping=stepping)
     child = subprocess.Popen(
@@ -68,7 +68,7 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, t
     assert again.run() == "completed", again.error
     assert verify(tmp_path / "c") == []
     assert kept.items() <= frames(tmp_path / "c").items(), "a finished frame was shot again"
-    told(
+    add_row(
         f"SIGKILL of the service: {name}",
         stepping,
         "resumed and completed",
@@ -77,7 +77,7 @@ def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, t
     )
 
 
-def test_sigkill_of_the_devices(simulated, tmp_path, told):
+def test_sigkill_of_the_devices(simulated, tmp_path, add_row):
     """The whole simulated stage dies in mid-capture; the capture fails, and names a device."""
     rig_file, _world = simulated()
     rig = tmp_path / "rig.toml"
@@ -113,7 +113,7 @@ def test_sigkill_of_the_devices(simulated, tmp_path, told):
     assert run.error is not None
     assert "unknown, unsafe" in run.error  # nobody is there to say that the lamps are off
     assert len(frames(tmp_path / "c")) >= 2 * 5
-    told("SIGKILL of the simulated stage", "software", str(run.outcome), 0, run.error)
+    add_row("SIGKILL of the simulated stage", "software", str(run.outcome), 0, run.error)
 
 
 def frames(path: Path) -> dict[tuple[int, str], str]:

@@ -112,5 +112,5 @@ def test_requests_that_go_on_are_cut_off(stage, serve, tmp_path):
         until((tmp_path / "here").exists)
         service.stop()
         service.ended(0, r"after it was to stop; not ended: \d requests$")
-    assert "Traceback" not in service.told
+    assert "Traceback" not in service.log
     assert not is_lit(world)

@@ -255,7 +255,7 @@ RTU = '[devices.lights]\nkind = "modbus_rtu"\nport = "lights"'
         for k in c.links
     ],
 )
-def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, tmp_path, told):
+def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, tmp_path, add_row):
     rig = small_rig if link == "Modbus TCP" else small_rig.replace("[devices.lights]", RTU)
     rig_file, world = simulated(*one.faults, rig=rig)
     plan = resolve(CapturePlan(lights=LIGHTS, stepping=stepping), rig_file)
@@ -280,7 +280,7 @@ def test_a_fault_on_the_wire(one, stepping, link, simulated, small_rig, slack, t
         assert run.error is None
         assert len(capture.records) == len(plan.steps) * 2
     name = one.name if len(one.links) == 1 else f"{one.name} ({link})"
-    told(name, stepping, run.outcome, missing, run.error)
+    add_row(name, stepping, run.outcome, missing, run.error)
 
 
 def check_frames(capture: Capture) -> None:

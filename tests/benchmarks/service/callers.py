@@ -32,7 +32,7 @@ from appearance.sun_fit.fitted_appearance import FittedAppearance
 from benchmarks.command import Benchmark, option
 from benchmarks.results import markdown, save
 from benchmarks.service.crowd import LOADS
-from benchmarks.service.live import FLAT, HURRY_S, Live
+from benchmarks.service.live import DEVICES, FLAT, HURRY_S, Live
 from reconstruction import Model, Progress
 from simulators.subject.subject import make_subject
 from stage_service.cli.support.children import Children
@@ -338,23 +338,9 @@ width = 16
 height = 16
 [devices]
 watchdog_s = 10.0
-[devices.lights]
-port = 15020
-timeout_s = 5.0
-[devices.projectors]
-port = "projectors"
-timeout_s = 5.0
-[devices.trigger]
-port = "trigger"
-timeout_s = 5.0
-[devices.cameras]
-port = 15021
-timeout_s = 10.0
-busy_s = 60.0
-readout_s = 0.002
-[safety]
-living_subject = false
-[capture.exposure]
+"""
+    + DEVICES
+    + """[capture.exposure]
 dark = 0.02
 all_on = 0.02
 olat = 0.02

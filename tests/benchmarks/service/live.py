@@ -22,6 +22,24 @@ from stage_service.records.tokens import own_token
 
 FLAT = "benchmarks.service.flat_stage"
 """The module that is a stage without a renderer."""
+DEVICES = """[devices.lights]
+port = 15020
+timeout_s = 5.0
+[devices.projectors]
+port = "projectors"
+timeout_s = 5.0
+[devices.trigger]
+port = "trigger"
+timeout_s = 5.0
+[devices.cameras]
+port = 15021
+timeout_s = 10.0
+busy_s = 60.0
+readout_s = 0.002
+[safety]
+living_subject = false
+"""
+"""Tables of a rig file: the devices of the flat stage, on ports that its service replaces."""
 HURRY_S = 300.0
 """Whatever a service is to come to, it has by then, on a busy machine too."""
 

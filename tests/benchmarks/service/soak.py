@@ -27,7 +27,7 @@ from benchmarks.acquisition.rates import simulated
 from benchmarks.command import Benchmark, option
 from benchmarks.results import markdown, save
 from benchmarks.service.faults import HEAD, Cell, cells
-from benchmarks.service.live import Live, console
+from benchmarks.service.live import DEVICES, Live, console
 from reconstruction import Progress, verify
 from stage_service.cli.support.children import Children
 from stage_service.config import RigFile
@@ -250,7 +250,8 @@ def _judge(live: Live) -> dict[str, Any]:
     return {"outcomes": outcomes, "frames": frames, "wrong": wrong, "at_the_end": live.size()}
 
 
-RIG = """
+RIG = (
+    """
 name = "soak"
 [dome]
 lights = 60
@@ -280,29 +281,16 @@ height = 16
 [devices]
 hardware_stepping = true
 watchdog_s = 10.0
-[devices.lights]
-port = 15020
-timeout_s = 5.0
-[devices.projectors]
-port = "projectors"
-timeout_s = 5.0
-[devices.trigger]
-port = "trigger"
-timeout_s = 5.0
-[devices.cameras]
-port = 15021
-timeout_s = 10.0
-busy_s = 60.0
-readout_s = 0.002
-[safety]
-living_subject = false
-[capture.exposure]
+"""
+    + DEVICES
+    + """[capture.exposure]
 dark = 0.005
 all_on = 0.005
 olat = 0.005
 scanline = 0.005
 tracking = 0.005
 """
+)
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:

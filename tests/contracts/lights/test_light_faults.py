@@ -54,12 +54,12 @@ def test_a_disturbed_command_is_told_and_what_follows_is_right(bench, wire, kind
     timeout_s = one.driver.config.timeout_s
     text = text.format(timeout=f"{timeout_s:g}")
     began = time.monotonic()
-    with pytest.raises(error, match="putting lamp 5 on: .*" + text) as told:
+    with pytest.raises(error, match="putting lamp 5 on: .*" + text) as caught:
         one.driver.select(5)
     assert time.monotonic() - began < 3 * timeout_s  # one deadline, not several
-    assert told.value.device == one.driver.name
-    assert told.value.operation == "putting lamp 5 on"
-    assert told.value.todo
+    assert caught.value.device == one.driver.name
+    assert caught.value.operation == "putting lamp 5 on"
+    assert caught.value.todo
     until(lambda: goes_dark(one))
     assert one.lit() == []
     for lamp in (7, 8):

@@ -153,9 +153,9 @@ def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {f"ViewLayer.Combined.{c}": layer for c in "RGB"}
     OpenEXR.File(header, channels).write(str(path))
-    with pytest.raises(PictureError, match=r"got ViewLayer\.Combined.*: write .* as RGB") as told:
+    with pytest.raises(PictureError, match=r"got ViewLayer\.Combined.*: write .* as RGB") as caught:
         read_picture(path, Sensor(), (SIZE, SIZE))
-    assert "copy it again" not in str(told.value)
+    assert "copy it again" not in str(caught.value)
 
 
 def test_an_exr_of_grey_or_of_channels_of_several_types_is_read(tmp_path):

@@ -80,11 +80,11 @@ def ended(link: socket.socket) -> bool:
 
 
 def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
-    """It says which limit, and when to try again."""
-    told = answer.json()
-    assert (answer.status_code, told["type"]) == (status, "/docs/errors.md#no-place"), told
+    """The problem names the limit, and when to try again."""
+    problem = answer.json()
+    assert (answer.status_code, problem["type"]) == (status, "/docs/errors.md#no-place"), problem
     assert int(answer.headers["retry-after"]) > 0
-    assert all(word in told["detail"] for word in words), told["detail"]
+    assert all(word in problem["detail"] for word in words), problem["detail"]
 
 
 @pytest.fixture

@@ -131,9 +131,9 @@ def test_the_digest_is_that_of_the_protocols_example() -> None:
 @pytest.mark.parametrize(("given", "received"), [("", "a greeting"), ("wrong", "ERRA")])
 def test_a_wrong_password_is_named_and_not_told(rig: Rig, given: str, received: str) -> None:
     projector = rig.projector(PASSWORD, given)
-    with pytest.raises(DeviceError, match=f"expected the right password.*{received}") as told:
+    with pytest.raises(DeviceError, match=f"expected the right password.*{received}") as caught:
         projector.switch(True)
-    assert "wrong" not in str(told.value).replace("the password is wrong", "")
+    assert "wrong" not in str(caught.value).replace("the password is wrong", "")
     assert PASSWORD not in repr(rig.projector(PASSWORD, PASSWORD))
     assert rig.projector(PASSWORD, PASSWORD).power() is Power.STANDBY
 
@@ -163,11 +163,11 @@ def test_each_fault_of_the_wire_is_told_and_does_not_reach_the_next_question(
     projector = rig.projector()
     rig.faults = [("%1POWR", fault)]
     begun = time.monotonic()
-    with pytest.raises(DeviceError, match=text.format(timeout=f"{rig.timeout_s:g}")) as told:
+    with pytest.raises(DeviceError, match=text.format(timeout=f"{rig.timeout_s:g}")) as caught:
         projector.power()
-    assert type(told.value) is kind
+    assert type(caught.value) is kind
     assert time.monotonic() - begun < 5 * rig.timeout_s
-    assert f"projector front (PJLink 127.0.0.1:{projector.port}): reading" in str(told.value)
+    assert f"projector front (PJLink 127.0.0.1:{projector.port}): reading" in str(caught.value)
     assert projector.power() is Power.STANDBY
     assert rig.faults == []
 
@@ -185,9 +185,9 @@ def test_a_broken_greeting_is_told_and_nothing_is_switched(
 ) -> None:
     projector = rig.projector()
     rig.faults = [(GREETING, fault)]
-    with pytest.raises(DeviceError, match=text) as told:
+    with pytest.raises(DeviceError, match=text) as caught:
         projector.switch(True)
-    assert type(told.value) is kind
+    assert type(caught.value) is kind
     assert projector.power() is Power.STANDBY
 
 
