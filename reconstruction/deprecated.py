@@ -1,12 +1,12 @@
-"""Old names of keys, fields and options that users may still have, read until 0.3.
+"""Old names of keys that users may still have, read until 0.3.
 
-`RENAMED` is the only table of them, `with_new_names` and `with_new_options` its only readers.
+`RENAMED` is the only table of them, `with_new_names` its only reader.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -31,34 +31,15 @@ def with_new_names(kind: str, document: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         BothNamesError: if a key is there under both names.
     """
-    names = _new_names(kind, document)
-    return {names.get(key, key): value for key, value in document.items()}
-
-
-def with_new_options(command: str, arguments: Sequence[str]) -> list[str]:
-    """Command-line `arguments` with old options (`--old`, `--old=3`) replaced by new ones.
-
-    `command` is the kind in `RENAMED`. Raises `BothNamesError` as `with_new_names` does.
-    """
-    end = arguments.index("--") if "--" in arguments else len(arguments)
-    split = [argument.partition("=") for argument in arguments[:end]]
-    names = _new_names(command, [option for option, _, _ in split])
-    replaced = [names.get(option, option) + sign + value for option, sign, value in split]
-    return [*replaced, *arguments[end:]]
-
-
-def _new_names(kind: str, keys: Iterable[str]) -> dict[str, str]:
-    """Old name: new name, of the old names among `keys`."""
-    table, found = RENAMED.get(kind, {}), set(keys)
-    names = {old: new for old, new in table.items() if old in found}
+    names = {old: new for old, new in RENAMED.get(kind, {}).items() if old in document}
     for old, new in names.items():
-        if new in found:
+        if new in document:
             raise BothNamesError(
                 f"{kind}: found both {old!r} and {new!r}; {old!r} is the old name of {new!r}:"
                 f" remove {old!r}"
             )
         _warn(kind, old, new)
-    return names
+    return {names.get(key, key): value for key, value in document.items()}
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Old names of keys and options are read, reported once and refused beside the new name."""
+"""Old names of keys are read, reported once and refused beside the new name."""
 
 import logging
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction import deprecated
-from reconstruction.deprecated import RENAMED, BothNamesError, with_new_names, with_new_options
+from reconstruction.deprecated import RENAMED, BothNamesError, with_new_names
 
 PAGE = Path(__file__).parents[2] / "docs/reference/files.md"
 
@@ -15,9 +15,7 @@ PAGE = Path(__file__).parents[2] / "docs/reference/files.md"
 @pytest.fixture(autouse=True)
 def table(monkeypatch):
     """A table of its own; no warning was logged yet."""
-    monkeypatch.setattr(
-        deprecated, "RENAMED", {"rig.toml": {"old": "new"}, "hairstage fit": {"--old": "--new"}}
-    )
+    monkeypatch.setattr(deprecated, "RENAMED", {"rig.toml": {"old": "new"}})
     deprecated._warn.cache_clear()
     yield
     deprecated._warn.cache_clear()
@@ -31,17 +29,9 @@ def test_old_keys_are_replaced_with_one_warning_that_names_both(caplog):
     assert with_new_names("another", {"old": 1}) == {"old": 1}
 
 
-def test_old_options_are_replaced_before_the_end_of_options():
-    arguments = ["--old=3", "x", "--other", "--", "--old"]
-    replaced = ["--new=3", "x", "--other", "--", "--old"]
-    assert with_new_options("hairstage fit", arguments) == replaced
-
-
 def test_both_names_together_are_refused():
     with pytest.raises(BothNamesError, match=r"rig\.toml.*'old'.*'new'"):
         with_new_names("rig.toml", {"old": 1, "new": 1})
-    with pytest.raises(BothNamesError):
-        with_new_options("hairstage fit", ["--old", "1", "--new=2"])
 
 
 def test_the_reference_lists_the_table():
