@@ -258,7 +258,7 @@ class DevicesConfig(Strict):
         if self.heartbeat_s > self.watchdog_s / 2:
             raise ValueError(
                 f"heartbeat_s {self.heartbeat_s} must be at most half of watchdog_s "
-                f"{self.watchdog_s}, or one late beat puts the lamps off"
+                f"{self.watchdog_s}, or one late beat switches the lamps off"
             )
         return self
 

@@ -28,7 +28,9 @@ def small(tmp_path: Path):
             "reconstruction/a.py": "from reconstruction import b\n\n\ndef seen():  # told\n    0\n",
             "reconstruction/b.py": '"""Told."""\n\n\ndef f():\n    import reconstruction.a\n',
             "stage_service/cli.py": 'from reconstruction.a import f\n\nprint("it is told")\n',
-            "tests/reconstruction/test_a.py": "1\n2\n",
+            "stage_service/web/a.js": 'let told; // "told"\nseen(told, "it is told", "/told");\n',
+            "stage_service/web/a.css": ".asked { color: red; } /* seen */\n",
+            "tests/reconstruction/test_a.py": "def test_it_is_told(seen):\n    told = seen\n",
         },
     )
 
@@ -41,7 +43,10 @@ def test_figures_of_a_tree(small) -> None:
     assert figures["README words"] == 4
     assert figures["docs words by hand"] == 4 + 4 - 1
     kinds = {k.removeprefix("old vocabulary, "): n for k, n in figures.items() if "old" in k}
-    assert kinds == {"docs": 1, "ui": 1, "names": 1, "comments": 2}
+    assert kinds == {
+        **{"docs": 1, "ui": 2, "names": 1, "comments": 2},
+        **{"js names": 3, "js comments": 2, "test names": 3},
+    }
 
 
 def test_parts_have_the_entry_that_reaches_them(small) -> None:

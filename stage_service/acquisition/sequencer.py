@@ -220,7 +220,7 @@ class Sequencer:
             stack.callback(frames.close)
             stack.callback(devices.close)
             # The heartbeat ends before the blackout begins: if the blackout fails, the bank's own
-            # watchdog puts the lamps off.
+            # watchdog switches the lamps off.
             stack.callback(self._black_out)
             devices.connect()
             check_interlocks(devices)

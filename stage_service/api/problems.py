@@ -176,7 +176,7 @@ http 400 The request cannot be served
     The status has the reason: no such route, method not allowed, a host name that is not this
     service's, or a request that took too long to arrive.
 internal 500 An internal error of the service
-    The service's log has the traceback. If the service dies, the watchdog puts the lamps off.
+    The service's log has the traceback. If the service dies, the watchdog switches the lamps off.
 """
 """Anchor, status and title of each kind, then what to do."""
 

@@ -200,6 +200,13 @@ def split_name(name: str) -> list[str]:
     return [name.strip("_").lower(), *(p.lower() for p in parts)]
 
 
+def in_name(place: str, name: str, words: list[Word]) -> Iterator[Entry]:
+    parts = split_name(name)
+    for word in words:
+        if word.name and any(word.name.fullmatch(p) for p in parts):
+            yield Entry(place, name, word.use)
+
+
 def python_entries(tree: Tree, file: str, words: list[Word]) -> dict[str, list[Entry]]:
     """Entries of a module: in public names, in strings that users read, in comments."""
     text = tree.text(file)
@@ -221,13 +228,8 @@ def python_entries(tree: Tree, file: str, words: list[Word]) -> dict[str, list[E
             targets = part.targets if isinstance(part, ast.Assign) else [getattr(part, "target", 0)]
             names += [(t.lineno, t.id) for t in targets if isinstance(t, ast.Name)]
     for line, name in names:
-        if name.startswith("_"):
-            continue
-        for word in words:
-            parts = split_name(name) if word.name else []
-            hit = next((p for p in parts if word.name and word.name.fullmatch(p)), None)
-            if hit:
-                found["names"].append(Entry(f"{file}:{line}", name, word.use))
+        if not name.startswith("_"):
+            found["names"] += in_name(f"{file}:{line}", name, words)
     for node in ast.walk(module):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             kind = "comments" if id(node) in docs else "ui"
@@ -241,38 +243,66 @@ def python_entries(tree: Tree, file: str, words: list[Word]) -> dict[str, list[E
     return found
 
 
-def page_entries(tree: Tree, file: str, words: list[Word]) -> list[Entry]:
-    """Entries of a script or page of a browser: strings and text; comments are left out."""
-    text = re.sub(
-        r"/\*.*?\*/|<!--.*?-->|^\s*//.*$",
-        lambda m: "\n" * m[0].count("\n"),
-        tree.text(file),
-        flags=re.DOTALL | re.MULTILINE,
-    )
-    if file.endswith(".js"):  # what stands in quotes and is a sentence
-        quoted = r"\"[^\"\n]*\"|'[^'\n]*'|`[^`]*`"
-        spans = [(m.start(), m[0]) for m in re.finditer(quoted, text) if " " in m[0]]
-    else:
-        spans = [(0, text)]
-    return [
-        entry
-        for at, said in spans
-        for entry in in_text(f"{file}:{text.count(chr(10), 0, at) + 1}", said, words)
-    ]
+def test_name_entries(tree: Tree, file: str, words: list[Word]) -> Iterator[Entry]:
+    """Entries in the names that a test module defines; a test's own name is read as a sentence."""
+    names: dict[str, int] = {}
+    for node in ast.walk(ast.parse(tree.text(file))):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
+                names.setdefault(name, node.lineno)
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                names.setdefault(name, node.lineno)
+    for name, line in names.items():
+        if name.startswith("test_"):
+            yield from in_text(f"{file}:{line}", name.replace("_", " "), words)
+        else:
+            yield from in_name(f"{file}:{line}", name, words)
+
+
+def page_entries(tree: Tree, file: str, words: list[Word]) -> dict[str, list[Entry]]:
+    """Entries of a script, style sheet or page: in names, comments, and text that users see."""
+    code = tree.text(file)
+    found: dict[str, list[Entry]] = {"js names": [], "js comments": [], "ui": []}
+
+    def place(at: int) -> str:
+        return f"{file}:{code.count(chr(10), 0, at) + 1}"
+
+    def blank(match: re.Match[str]) -> str:
+        return re.sub(r"[^\n]", " ", match[0])
+
+    comment = re.compile(r"/\*.*?\*/|<!--.*?-->|(?<!:)//[^\n]*", re.DOTALL)
+    for match in comment.finditer(code):
+        found["js comments"] += in_text(place(match.start()), match[0], words)
+    bare = comment.sub(blank, code)
+    if file.endswith(".html"):
+        found["ui"] += in_text(file, bare, words)
+        return found
+    for match in re.finditer(r"\"[^\"\n]*\"|'[^'\n]*'|`[^`]*`", bare):
+        if " " in match[0]:  # a sentence, not a key
+            found["ui"] += in_text(place(match.start()), match[0], words)
+    names: dict[str, int] = {}
+    for match in re.finditer(r"[A-Za-z_$][\w$]*", re.sub(r"\"[^\"\n]*\"", blank, bare)):
+        names.setdefault(match[0], match.start())
+    for name, at in names.items():
+        found["js names"] += in_name(place(at), name, words)
+    return found
 
 
 def old_words(tree: Tree) -> dict[str, list[Entry]]:
-    """Entries by kind: docs, ui, names, comments."""
+    """Entries by kind: docs, ui, names, comments, and those of scripts and of tests' names."""
     words = vocabulary()
-    found: dict[str, list[Entry]] = {"docs": [], "ui": [], "names": [], "comments": []}
+    kinds = ("docs", "ui", "names", "comments", "js names", "js comments", "test names")
+    found: dict[str, list[Entry]] = {kind: [] for kind in kinds}
     for page in [p for p in hand_written(tree) if p != "CHANGELOG.md"]:
         found["docs"] += in_text(page, prose(tree.text(page)), words)
-    for file in tree.files(*PACKAGES):
-        for kind, entries in python_entries(tree, file, words).items():
+    files = [(file, python_entries) for file in tree.files(*PACKAGES)]
+    for suffix in (".js", ".mjs", ".html", ".css"):
+        files += [(file, page_entries) for file in tree.files("stage_service", suffix=suffix)]
+    for file, entries_of in files:
+        for kind, entries in entries_of(tree, file, words).items():
             found[kind] += entries
-    for suffix in (".js", ".html"):
-        for file in tree.files("stage_service", suffix=suffix):
-            found["ui"] += page_entries(tree, file, words)
+    for file in tree.files("tests"):
+        found["test names"] += test_name_entries(tree, file, words)
     return found
 
 

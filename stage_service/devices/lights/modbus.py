@@ -366,7 +366,7 @@ class ModbusLightBank:
     def _no_reply(self, doing: str, error: NoReply | OSError) -> DeviceError:
         """The error where no reply came; closes the link."""
         self.close()
-        left = "its watchdog puts the lamps off"
+        left = "its watchdog switches the lamps off"
         if not self.capabilities.dead_man:
             left = "its lamps may still be lit"
         todo = f"Check power and cable of the bank; {left}."

@@ -43,14 +43,14 @@ export class Controls {
     this.light().catch((error) => viewer.status(error.message));
   }
 
-  // Light comes later: the strands do not wait for the renderer.
+  // Light is loaded after the strands are drawn.
   async light() {
     const { viewer } = this;
     viewer.relight = this.relight = await Relight.begin(viewer);
-    if (this.relight.told.material) this.colour.append(
+    if (this.relight.data.material) this.colour.append(
       element("option", { value: "lit", textContent: "lit" }));
     this.panel.append(...this.relight.controls());
-    const { camera } = viewer.picture.state;  // chosen meanwhile
+    const { camera } = viewer.picture.state;  // selected meanwhile
     if (camera) await this.look(camera.name);
   }
 
@@ -95,7 +95,7 @@ export class Controls {
       labelled("through", this.through), ...this.overlay];
   }
 
-  // A click near a camera's frustum looks through it.
+  // A click near a camera's frustum selects its view.
   pick(event) {
     const { viewer } = this, { state } = viewer.picture, { canvas } = viewer;
     if (!state.wires || state.camera) return;
@@ -118,7 +118,7 @@ export class Controls {
     const shown = document.getElementById("sum");
     state.camera = viewer.about.cameras.find((c) => c.name === name) ?? null;
     this.through.value = name;
-    const captured = Boolean(name) && relight?.told.captured;
+    const captured = Boolean(name) && relight?.data.captured;
     this.overlay.forEach((x) => { x.hidden = !captured; });
     shown.hidden = !captured;
     if (!captured) {
@@ -135,11 +135,11 @@ export class Controls {
     await relight.set(relight.weights);
   }
 
-  // What is captured is shown left of `share` of the picture, what is drawn right of it and over it.
+  // Captured frames are shown left of `share` of the picture, the model right of it.
   wiped(share) {
     const { viewer } = this, { state } = viewer.picture, shown = document.getElementById("sum");
     const cut = `${(100 * share).toFixed(2)}%`;
-    const over = state.opacity < 1;  // then strands are seen through, over the whole photograph
+    const over = state.opacity < 1;  // transparent strands cover the whole photograph
     shown.style.clipPath = over ? "" : `inset(0 calc(100% - ${cut}) 0 0)`;
     viewer.canvas.style.clipPath = state.camera && !over ? `inset(0 0 0 ${cut})` : "";
   }

@@ -1,15 +1,15 @@
-// The little of WebGL2 that the viewer needs.
+// Helpers for WebGL2.
 
 export function context(canvas) {
   const gl = canvas.getContext("webgl2", {
     alpha: true, premultipliedAlpha: true, antialias: false, depth: true,
     powerPreference: "high-performance", preserveDrawingBuffer: true,
   });
-  if (!gl) throw new Error("this browser has no WebGL2: the viewer cannot draw here");
+  if (!gl) throw new Error("The viewer needs WebGL2, which this browser does not support.");
   const [half, full, blend] = ["EXT_color_buffer_half_float", "EXT_color_buffer_float", "EXT_float_blend"]
     .map((name) => gl.getExtension(name));
-  if (!half && !full) throw new Error("this browser's WebGL2 draws no floats: the viewer cannot draw here");
-  // tablets have no blending of full floats: halves are added up there
+  if (!half && !full) throw new Error("The viewer needs float textures to draw into, which this browser does not support.");
+  // without EXT_float_blend (tablets), samples are summed in half floats
   gl.summed = full && blend ? gl.RGBA32F : gl.RGBA16F;
   gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   return gl;
@@ -39,7 +39,7 @@ export class Program {
     }
   }
 
-  // Values by name; what the shader does not use is passed over. Textures are {unit, texture, kind}.
+  // Set uniforms by name; unused ones are skipped. Textures are {texture, kind}.
   use(values) {
     const gl = this.gl;
     gl.useProgram(this.program);
@@ -80,7 +80,7 @@ export function buffer(gl, target, data) {
   return made;
 }
 
-// A picture to draw into: colour in `format`; `depth` is "none", "drawn" or "read" by shaders.
+// A render target: colour in `format`; `depth` is "none", "drawn" or "read" by shaders.
 export class Film {
   constructor(gl, format, depthIs) {
     Object.assign(this, { gl, format, depthIs, width: 0, height: 0 });

@@ -1,14 +1,14 @@
-// A set of strands on the graphics card, filled while it arrives: coarse to fine.
+// Strands on the graphics card, uploaded in batches: coarse to fine.
 
 import { buffer, texture } from "./gl.js";
 import { bytes } from "./net.js";
 
-const WIDE = 4096;  // texels of a row at most; WebGL2 promises 2048, everything has 4096
+const WIDE = 4096;  // texels in a row at most; WebGL2 guarantees 2048, all known devices support 4096
 const FIRST = 1500, MORE = 12000;
 
 export class Hair {
-  constructor(gl, which, told) {
-    Object.assign(this, { gl, which, ...told, here: 0, level: null });
+  constructor(gl, which, description) {
+    Object.assign(this, { gl, which, ...description, here: 0, level: null });
     this.widest = Math.min(WIDE, gl.getParameter(gl.MAX_TEXTURE_SIZE));
     this.perRow = Math.max(1, Math.floor(this.widest / this.points));
     this.rows = Math.max(1, Math.ceil(this.count / this.perRow));
@@ -21,7 +21,7 @@ export class Hair {
       () => gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8, 1, 1));
   }
 
-  // All strands, some rows of the textures at a time; `shown` is called after each.
+  // Load all strands in batches of texture rows; `shown` is called after each.
   async load(shown) {
     for (let row = 0; row * this.perRow < this.count;) {
       const wanted = row === 0 ? FIRST : MORE;
@@ -51,7 +51,7 @@ export class Hair {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, perRow, rows, gl.RG, gl.FLOAT, own);
   }
 
-  // A number 0 to 255 for each point, `channels` of them.
+  // A texture of `channels` values from 0 to 255 per point.
   perPoint(data, channels = 1) {
     const { gl, points, perRow, rows } = this;
     const [inside, format] = channels === 1 ? [gl.R8, gl.RED] : [gl.RGBA8, gl.RGBA];
@@ -71,7 +71,7 @@ export class Hair {
     };
   }
 
-  // `count` strands, as lines of one pixel or ribbons; all but every `skip`th point left out.
+  // Draw `count` strands as lines of one pixel or as ribbons, every `skip`th point.
   draw(ribbon, skip, count) {
     const gl = this.gl, steps = Math.ceil((this.points - 1) / skip) + 1;
     if (!count) return;
@@ -100,8 +100,8 @@ export class Head {
     gl.bindVertexArray(null);
   }
 
-  // How much of each of eight lights reaches each vertex: two groups of four, 0 to 255.
-  seen(groups) {
+  // Visibility of eight lights per vertex: two groups of four, 0 to 255.
+  setVisibility(groups) {
     const gl = this.gl;
     gl.bindVertexArray(this.array);
     groups.forEach((data, i) => {

@@ -4,10 +4,10 @@ import { Film, Program, buffer } from "./gl.js";
 import * as shaders from "./shaders.js";
 import { ofLight } from "./space.js";
 
-export const MODES = { direction: 0, confidence: 1, root: 2, length: 3, lit: 4 };
-const SAMPLES = 48, TURN = 3, LEAST_TURNS = 4;  // a light has TURN samples at a time
+const MODES = { direction: 0, confidence: 1, root: 2, length: 3, lit: 4 };
+const SAMPLES = 48, TURN = 3, LEAST_TURNS = 4;  // consecutive samples per light
 
-const BATCH_MS = 40;  // what a batch of strands is to take
+const BATCH_MS = 40;  // target duration of a batch of strands
 const NO_SLICE = [0, 0, 0, 1];
 
 export class Picture {
@@ -31,10 +31,10 @@ export class Picture {
     this.samples = 0;
     this.frames = 0;
     this.batch = 1000;
-    this.texels = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));  // a side of what a light sees
+    this.texels = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));  // side of the shadow map
   }
 
-  // What gives the uniforms of light; the programs for it are compiled when it is first wanted.
+  // `lighting` provides the uniforms of light; its programs are compiled at its first use.
   setLighting(lighting) {
     this.litStrands ??= new Program(
       this.gl, shaders.STRAND_VERTEX(shaders.LIT), shaders.STRAND_FRAGMENT);
@@ -59,7 +59,7 @@ export class Picture {
     gl.bindVertexArray(null);
   }
 
-  // Draw one frame in motion: lines of a pixel, straight to the page.
+  // Draw one frame in motion: lines of one pixel, straight to the page.
   moving(view) {
     this.again();
     this.frames++;
@@ -67,7 +67,7 @@ export class Picture {
     this.mark();
   }
 
-  // A part of one sample more of the picture at rest; false when there are enough.
+  // Draw part of the next sample of the picture at rest; false when it is complete.
   resting(view) {
     if (this.samples >= this.enough()) return false;
     this.sample ??= this.oneSample(view);
@@ -76,7 +76,7 @@ export class Picture {
     return true;
   }
 
-  // The samples that there are show what is no more.
+  // Discard the samples: the view or the light has changed.
   again() {
     this.samples = 0;
     this.sample = null;
@@ -117,13 +117,13 @@ export class Picture {
     if (number >= 4 && (cycle === TURN || number % cycle === 0)) this.showMean();
   }
 
-  // What one light sees first, drawn; the uniforms to shade by it, as bright as all together.
+  // Draw the shadow map of one light; return the uniforms to shade by it, as bright as all lights.
   *castShadow(from, round) {
     const gl = this.gl, hair = this.sets.model, { low, high } = hair, { lighting } = this;
     const { camera, range, texel } = ofLight(
       from.position, low, high, this.texels);
     const shift = [radical(round, 2) - 0.5, radical(round, 3) - 0.5];
-    const seen = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye, uFocal: camera.K[0][0] };
+    const lightView = { uMatrix: camera.matrix(...range, shift), uEye: camera.eye, uFocal: camera.K[0][0] };
     const begin = () => {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadow.frame);
       gl.viewport(0, 0, this.texels, this.texels);
@@ -134,21 +134,21 @@ export class Picture {
     gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     if (this.head) {
-      this.hidingHead.use(seen);
+      this.hidingHead.use(lightView);
       this.head.draw();
     }
     const shade = lighting.uniforms(from);
     for (let first = 0; first < hair.here;) {
-      const count = Math.min(this.batch, hair.here - first);  // which may change at every yield
+      const count = Math.min(this.batch, hair.here - first);  // may change at every yield
       begin();
       gl.bindVertexArray(this.empty);
       this.hidingFibres.use(
-        { ...seen, ...hair.uniforms(), uRibbon: this.state.width, uSkip: 1, uFirst: first });
+        { ...lightView, ...hair.uniforms(), uRibbon: this.state.width, uSkip: 1, uFirst: first });
       hair.draw(1, 1, count);
       first += count;
       yield;
     }
-    return { ...shade, uShadow: seen.uMatrix, uShadowRange: range,
+    return { ...shade, uShadow: lightView.uMatrix, uShadowRange: range,
       uTexel: texel, uShadowDepth: this.shadow.depth, uShadowOf: this.shadow.colour };
   }
 
@@ -161,15 +161,15 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The graphics card works asynchronously: `ready` is whether it has finished.
+  // Set a fence: `ready` checks whether the graphics card has passed it.
   mark() {
     const gl = this.gl;
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    this.asked = performance.now();
+    this.startedAt = performance.now();
     gl.flush();
   }
 
-  // Whether the last commands are done; `took` is their time in milliseconds.
+  // Whether the last commands have finished; `took` is their duration in ms.
   ready() {
     const gl = this.gl;
     if (!this.fence) return true;
@@ -177,7 +177,7 @@ export class Picture {
       return false;
     gl.deleteSync(this.fence);
     this.fence = null;
-    this.took = performance.now() - this.asked;
+    this.took = performance.now() - this.startedAt;
     if (this.sample) {
       const better = this.batch * Math.min(2, Math.max(0.5, BATCH_MS / Math.max(this.took, 1)));
       this.batch = Math.max(200, Math.min(1e6, Math.round(better)));
@@ -187,7 +187,7 @@ export class Picture {
 
   exposure() { return this.state.mode === "lit" ? this.state.exposure : 1; }
 
-  // The mean picture as it was added up: linear radiance and coverage, rows from the bottom.
+  // The mean picture: linear radiance and coverage, rows from the bottom.
   radiance() {
     const gl = this.gl, { width, height } = this.canvas;
     const out = new Float32Array(4 * width * height);
@@ -246,7 +246,7 @@ export class Picture {
   // The uniforms of all light, or of the one whose turn it is.
   light(how) { return how.light ?? (this.lit() ? this.lighting.uniforms() : {}); }
 
-  // The view of the model, which may have half of the page.
+  // The view of the model, which may occupy half of the page.
   ofModel(view) {
     const { width, height } = this.canvas;
     return view(this.state.show === "beside" ? Math.floor(width / 2) : width, height);
@@ -254,7 +254,7 @@ export class Picture {
 
   lit() { return this.state.mode === "lit" && this.lighting; }
 
-  // At rest all strands, a batch at a time; in motion as many as go quickly, at once.
+  // At rest: all strands in batches; in motion: as many as the frame rate allows.
   *strands(name, flat, common, how, begin) {
     const gl = this.gl, hair = this.sets[name], { state } = this;
     if (!hair) return;
@@ -283,7 +283,7 @@ export class Picture {
   }
 }
 
-function radical(i, base) {  // van der Corput: well spread in [0, 1)
+function radical(i, base) {  // van der Corput sequence in [0, 1)
   let out = 0;
   for (let f = 1 / base; i > 0; i = Math.floor(i / base), f /= base) out += f * (i % base);
   return out;

@@ -1,14 +1,14 @@
-// Relighting by the dome or an environment map, of captured frames (sums by the server) and of the
-// fitted model (the shader).
+// Relighting by the dome or an environment map: of captured frames (summed by the server) and of the
+// fitted model (in the shader).
 
-import { choice, element, labelled, slider } from "./controls.js";
+import { element, labelled, slider } from "./controls.js";
 import { texture } from "./gl.js";
 import * as net from "./net.js";
 import { dot, unit } from "./space.js";
 
 const NEAREST = 3;
-const MOST_KEPT = 24;  // lights whose visibility is cached; more than are shaded at once
-const TRACED_PIXELS = 50000;  // of a view in which indirect light is traced
+const MOST_CACHED = 24;  // lights whose visibility is cached; more than are shaded at once
+const TRACED_PIXELS = 50000;  // resolution of traced indirect light
 
 // Mean radiance of pixels [radiance × weight, weight].
 function meanOf(pixels) {
@@ -22,17 +22,17 @@ export class Relight {
     return new Relight(viewer, await net.json(net.ofModel("/lighting")));
   }
 
-  constructor(viewer, told) {
-    Object.assign(this, { viewer, told, weights: {}, painting: false, lights: [], kept: new Map() });
-    this.directions = told.lights.map((l) => unit(l.position));
+  constructor(viewer, data) {
+    Object.assign(this, { viewer, data, weights: {}, painting: false, lights: [], cache: new Map() });
+    this.directions = data.lights.map((l) => unit(l.position));
     const { state } = viewer.picture;
-    this.base = told.exposure;
+    this.base = data.exposure;
     state.exposure = this.base;
   }
 
-  // --- the material, once
+  // Load the material, once.
   async material() {
-    const { gl, picture } = this.viewer, { material } = this.told;
+    const { gl, picture } = this.viewer, { material } = this.data;
     const values = new Float32Array(await net.bytes("/table"));
     const [wide, high] = [material.turns, 4 * material.cosines];
     this.table = texture(gl, gl.TEXTURE_2D, gl.LINEAR, () => {
@@ -44,19 +44,19 @@ export class Relight {
     picture.setLighting(this);
   }
 
-  // How often each light has its turn until all that it stands for had theirs.
+  // Turns until every light of each cluster has been drawn.
   turns() { return Math.max(1, ...this.lights.map((l) => l.turns.length)); }
 
-  // What stands for light number `only` in a turn of it.
+  // The light that represents cluster `only` in this turn.
   inTurn(only, turn) { const { turns } = this.lights[only]; return turns[turn % turns.length]; }
 
-  // Indirect light in the view of `camera`: the server traces it when the view is at rest, once for
-  // a view and a light. Resolves with the response.
+  // Indirect light in the view of `camera`, traced by the server once per view and light when the view
+  // is at rest.
   inView(camera) {
-    const asked = JSON.stringify([this.weights, camera]);
-    if (asked === this.rest?.asked) return this.rest.done;
+    const key = JSON.stringify([this.weights, camera]);
+    if (key === this.rest?.key) return this.rest.done;
     for (const old of Object.values(this.rest?.textures ?? {})) this.viewer.gl.deleteTexture(old.texture);
-    const rest = this.rest = { asked };
+    const rest = this.rest = { key };
     rest.done = this.traceView(rest, camera).catch((error) => this.viewer.status(error.message));
     return rest.done;
   }
@@ -77,9 +77,9 @@ export class Relight {
     picture.again();
   }
 
-  // All lights, or one alone, as bright as if it stood for all turns of `lights`.
+  // Uniforms of all lights, or of one, scaled to the power of all.
   uniforms(only) {
-    const { material } = this.told, { model } = this.viewer.picture.sets;
+    const { material } = this.data, { model } = this.viewer.picture.sets;
     const used = only ? [only] : this.lights;
     const times = this.lights.length / Math.max(used.length, 1);
     const at = new Float32Array(24), power = new Float32Array(24);
@@ -88,8 +88,8 @@ export class Relight {
       power.set(l.intensity.map((x) => times * x), 3 * i);
     });
     return {
-      uLights: this.seen ? used.length : 0, uLightAt: at, uLightPower: power,
-      uSeen0: this.seen?.[0] ?? model.none, uSeen1: this.seen?.[1] ?? model.none,
+      uLights: this.visibility ? used.length : 0, uLightAt: at, uLightPower: power,
+      uVisible0: this.visibility?.[0] ?? model.none, uVisible1: this.visibility?.[1] ?? model.none,
       uTable: this.table, uVariance: material.variances, uTilt: material.tilt,
       uEta: material.eta, uLogistic: material.logistic_scale, uAbsorption: material.absorption,
       uGrid: [material.cosines, material.turns], uSkin: material.skin,
@@ -100,9 +100,9 @@ export class Relight {
   }
 
   ambient = 1;
-  mean = [[0, 0, 0], [0, 0, 0]];  // of the view that was traced last: hair, head; for motion
+  mean = [[0, 0, 0], [0, 0, 0]];  // over the last traced view: hair, head; used in motion
 
-  // --- the light
+  // Light from a direction: the nearest lights of the dome.
   towards(way, colour = [1, 1, 1]) {
     const direction = unit(way);
     const near = this.directions.map((d, i) => [Math.acos(Math.min(1, dot(d, direction))), i])
@@ -121,21 +121,21 @@ export class Relight {
   async set(weights) {
     this.weights = weights;
     this.paintDome?.();
-    if (this.under) { this.again = true; return; }  // one at a time: the latest wins
-    this.under = true;
+    if (this.applying) { this.pending = true; return; }  // one at a time, then the latest
+    this.applying = true;
     do {
-      this.again = false;
+      this.pending = false;
       try { await this.apply(); } catch (error) { this.viewer.status(error.message); }
-    } while (this.again);
-    this.under = false;
+    } while (this.pending);
+    this.applying = false;
   }
 
   async apply() {
     const { viewer } = this, { state } = viewer.picture, body = this.body();
     const through = state.camera?.name;
     const jobs = [];
-    if (through && this.told.captured) jobs.push(this.showSum(through, body));
-    if (state.mode === "lit" && this.told.material) jobs.push(this.shade(body));
+    if (through && this.data.captured) jobs.push(this.showSum(through, body));
+    if (state.mode === "lit" && this.data.material) jobs.push(this.shade(body));
     await Promise.all(jobs);
     viewer.draw();
   }
@@ -148,12 +148,12 @@ export class Relight {
 
   async showSum(camera, body) {
     this.viewer.status("adding up captured frames");
-    const answer = await net.ask(net.ofModel(`/sums/${encodeURIComponent(camera)}.png`), body);
+    const response = await net.request(net.ofModel(`/sums/${encodeURIComponent(camera)}.png`), body);
     const shown = document.getElementById("sum");
     if (shown.src) URL.revokeObjectURL(shown.src);
-    shown.src = URL.createObjectURL(await answer.blob());
+    shown.src = URL.createObjectURL(await response.blob());
     await shown.decode();
-    const missing = this.told.missing[camera];
+    const missing = this.data.missing[camera];
     this.viewer.status(
       missing ? `${missing} frames of ${camera} are missing: those of the nearest lights are used` : "");
   }
@@ -162,42 +162,41 @@ export class Relight {
     const { viewer } = this, { picture, gl } = viewer, hair = picture.sets.model;
     const lights = await net.json(net.ofModel("/few"), body);
     const points = hair.count * hair.points, vertices = picture.head?.vertices ?? 0;
-    await this.keep(lights.map((l) => l.number));
+    await this.cacheVisibility(lights.map((l) => l.number));
     const groups = [0, 1].map((g) => {
       const some = lights.slice(4 * g, 4 * g + 4);
       const strands = new Uint8Array(4 * points), head = new Uint8Array(4 * vertices);
       some.forEach(({ number }, k) => {
-        const data = this.kept.get(number);
+        const data = this.cache.get(number);
         for (let i = 0; i < points; i++) strands[4 * i + k] = data[i];
         for (let i = 0; i < vertices; i++) head[4 * i + k] = data[points + i];
       });
       return { strands, head, used: some.length > 0 };
     });
-    for (const old of this.seen ?? []) if (old !== hair.none) gl.deleteTexture(old.texture);
-    this.seen = groups.map((g) => g.used ? hair.perPoint(g.strands, 4) : hair.none);
-    picture.head?.seen(groups.map((g) => g.head));
+    for (const old of this.visibility ?? []) if (old !== hair.none) gl.deleteTexture(old.texture);
+    this.visibility = groups.map((g) => g.used ? hair.perPoint(g.strands, 4) : hair.none);
+    picture.head?.setVisibility(groups.map((g) => g.head));
     this.lights = lights;
     viewer.draw();
     viewer.status("");
   }
 
-  // Have what these lights see in `kept`, of the others those that were shaded last.
-  async keep(numbers) {
-    if (numbers.some((n) => !this.kept.has(n))) this.viewer.status("casting shadows");
+  // Load the visibility of these lights into `cache`, which keeps those used last.
+  async cacheVisibility(numbers) {
+    if (numbers.some((n) => !this.cache.has(n))) this.viewer.status("casting shadows");
     for (const number of numbers) {
-      const data = this.kept.get(number) ?? new Uint8Array(await net.bytes(`/visibility/${number}`));
-      this.kept.delete(number);  // a Map has its keys in the order in which they came
-      this.kept.set(number, data);
+      const data = this.cache.get(number) ?? new Uint8Array(await net.bytes(`/visibility/${number}`));
+      this.cache.delete(number);  // a Map iterates in insertion order
+      this.cache.set(number, data);
     }
-    for (const old of this.kept.keys()) {
-      if (this.kept.size <= MOST_KEPT) break;
-      this.kept.delete(old);
+    for (const old of this.cache.keys()) {
+      if (this.cache.size <= MOST_CACHED) break;
+      this.cache.delete(old);
     }
   }
 
-  // --- the panel
   controls() {
-    const { viewer, told } = this, { state } = viewer.picture;
+    const { viewer, data } = this, { state } = viewer.picture;
     const parts = [element("h2", { textContent: "Light" }), this.dome()];
     const colour = element("input", { type: "color", value: "#ffffff", ariaLabel: "colour of the paint" });
     this.colour = () => [1, 3, 5].map((i) =>
@@ -223,24 +222,24 @@ export class Relight {
       labelled("exposure", slider(-6, 6, 0.1, 0, (stops) => {
         state.exposure = this.base * 2 ** stops;
         viewer.draw();
-          if (state.camera) this.set(this.weights);
+        if (state.camera) this.set(this.weights);
       })));
     for (const kind of ["dragover", "drop"])
       document.addEventListener(kind, (e) => {
         e.preventDefault();
         if (kind === "drop" && e.dataTransfer.files[0]) this.drop(e.dataTransfer.files[0]);
       });
-    if (told.material) {
+    if (data.material) {
       parts.push(labelled("indirect", slider(0, 2, 0.05, this.ambient, (v) => {
         this.ambient = v;
         viewer.draw();
       })));
-      const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and what leaves " +
-        "later) with shadows. Indirect light, times “indirect”, is path-traced when the view is at rest; " +
-        "in motion its mean over the view is added."];
-      if (!told.material.one_material) notes.push("One material is shown: the mean of its map.");
-      if (told.material.field) notes.push("The model's field is not shown.");
-      notes.push("Of an environment up to 64 lights are shaded at rest, eight in motion.");
+      const notes = ["Colour “lit”: direct light of the fitted fibres (R, TT, TRT and " +
+        "higher orders) with shadows. Indirect light, scaled by “indirect”, is path-traced when the view is " +
+        "at rest; in motion its mean over the view is added."];
+      if (!data.material.one_material) notes.push("The viewer shows one material: the mean of the map.");
+      if (data.material.field) notes.push("The viewer does not show the model's reflectance field.");
+      notes.push("An environment is shaded by up to 64 lights at rest, eight in motion.");
       parts.push(element("p", { textContent: notes.join(" ") }));
     }
     return parts;
@@ -255,7 +254,7 @@ export class Relight {
     try { await this.set(await get()); } catch (error) { this.viewer.status(error.message); }
   }
 
-  // The dome seen from in front: the middle is before the face, the rim behind the head.
+  // The dome from the front: its centre is before the face, its rim behind the head.
   dome() {
     const canvas = this.canvas = element("canvas", { id: "dome", width: 520, height: 520, tabIndex: 0 });
     canvas.setAttribute("aria-label", "the dome from the front: drag to move the light");

@@ -24,7 +24,7 @@ vec3 tangent(int strand, int k) {
   vec3 t = place(strand, min(k + 1, uCount - 1)) - place(strand, max(k - 1, 0));
   return t / max(length(t), 1e-9);
 }
-vec3 across(vec3 t, vec3 view) {  // to the right of the strand, seen from the eye
+vec3 across(vec3 t, vec3 view) {  // to the right of the strand in the view
   vec3 side = cross(t, view);
   float wide = length(side);
   return wide > 1e-4 ? side / wide : vec3(0.0);
@@ -66,9 +66,9 @@ void main() {
   gl_Position = uMatrix * vec4(q, 1.0);
 }`;
 
-// A round fibre: a ribbon across the eye, of which each fragment knows where on the fibre it lies. The
-// ribbon is two pixels wide at least, and fragments beside the fibre are discarded: rasterisers put
-// corners on a grid of 1/16 pixel here and there, on which a thinner one is lost.
+// A round fibre: a ribbon facing the eye, with the offset from the fibre's axis per fragment. The ribbon
+// is at least two pixels wide, and fragments beside the fibre are discarded: some rasterisers snap corners
+// to a grid of 1/16 pixel, which loses thinner ribbons.
 export const FIBRE_VERTEX = STRAND + `
 uniform float uFocal;  // pixels
 out vec3 vPlace, vTangent, vFacing;
@@ -135,19 +135,19 @@ void main() {
 
 export const HEAD_VERTEX = HEAD + `
 layout(location = 0) in vec3 aPlace;
-layout(location = 1) in vec4 aSeen0;
-layout(location = 2) in vec4 aSeen1;
+layout(location = 1) in vec4 aVisible0;
+layout(location = 2) in vec4 aVisible1;
 uniform mat4 uMatrix;
 out vec3 vPlace;
-out vec4 vSeen0, vSeen1;
+out vec4 vVisible0, vVisible1;
 void main() {
-  vPlace = aPlace; vSeen0 = aSeen0; vSeen1 = aSeen1;
+  vPlace = aPlace; vVisible0 = aVisible0; vVisible1 = aVisible1;
   gl_Position = uMatrix * vec4(aPlace, 1.0);
 }`;
 
 export const HEAD_FRAGMENT = (lighting) => HEAD + SHOWN + `
 in vec3 vPlace;
-in vec4 vSeen0, vSeen1;
+in vec4 vVisible0, vVisible1;
 uniform vec3 uEye;
 uniform vec4 uSlice;
 uniform int uMode;
@@ -159,7 +159,7 @@ void main() {
   vec3 view = normalize(uEye - vPlace);
   if (dot(n, view) < 0.0) n = -n;
   vec3 c = vec3(0.11, 0.105, 0.1) * (0.25 + 0.75 * dot(n, view));
-  if (uMode == 4) c = skin(vPlace, n, vSeen0, vSeen1);
+  if (uMode == 4) c = skin(vPlace, n, vVisible0, vVisible1);
   oColour = vec4(uLinear == 1 ? c : shown(c), 1.0);
 }`;
 
@@ -218,7 +218,7 @@ float longitudinal(float si, float ci, float so, float co, float v) {
   return scaledI0(ci * co * r) * exp(-0.5 * chord * r) * r / (1.0 - exp(-2.0 * r));
 }
 struct Tilted { vec4 sines, cosines; };
-Tilted tilted(float si, float ci, float tilt) {  // the inclination that R, TT, TRT and the rest see
+Tilted tilted(float si, float ci, float tilt) {  // inclinations for R, TT, TRT and higher orders
   float s1 = sin(tilt), c1 = cos(tilt), s2 = 2.0 * s1 * c1, c2 = c1 * c1 - s1 * s1;
   float s4 = 2.0 * s2 * c2, c4 = c2 * c2 - s2 * s2;
   return Tilted(vec4(si * c2 + ci * s2, si * c1 - ci * s1, si * c4 - ci * s4, si),
@@ -226,8 +226,8 @@ Tilted tilted(float si, float ci, float tilt) {  // the inclination that R, TT, 
 }
 `;
 
-// Direct light of the hair's BSDF seen from afar: M_p of each lobe, times a table of the mean of
-// A_p N_p over the fibre's width (appearance/bsdf/far_field.py), times what the shadow lets through.
+// Far-field direct light of the hair's BSDF: M_p of each lobe, times a table of the mean of A_p N_p over
+// the fibre's width (appearance/bsdf/far_field.py), times the light's visibility.
 const LIGHTS = `
 uniform int uLights;
 uniform vec3 uLightAt[8], uLightPower[8];
@@ -242,7 +242,7 @@ vec3 incoming(int i, vec3 p, out vec3 l) {
 `;
 
 export const LIT = LIGHTS + `
-uniform sampler2D uSeen0, uSeen1, uTable;
+uniform sampler2D uVisible0, uVisible1, uTable;
 uniform vec4 uVariance;
 uniform float uTilt;
 uniform vec2 uGrid;  // cosines, turns
@@ -254,26 +254,26 @@ ${LONGITUDINAL}vec3 azimuthal(int lobe, float cosine, float turn) {
 vec3 lit(vec3 p, vec3 t, vec3 view, int strand, ivec2 at) {
   float si = clamp(dot(t, view), -1.0, 1.0), ci = sqrt(max(1.0 - si * si, 1e-8));
   Tilted leans = tilted(si, ci, uTilt);
-  vec4 seen0 = texelFetch(uSeen0, at, 0), seen1 = texelFetch(uSeen1, at, 0);
+  vec4 visible0 = texelFetch(uVisible0, at, 0), visible1 = texelFetch(uVisible1, at, 0);
   vec3 across = (view - si * t) / ci, sum = uAmbient * uHairIndirect;
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
-    float seen = i < 4 ? seen0[i] : seen1[i - 4];
-    if (seen == 0.0) continue;
+    float visible = i < 4 ? visible0[i] : visible1[i - 4];
+    if (visible == 0.0) continue;
     float so = clamp(dot(t, l), -1.0, 1.0), co = sqrt(max(1.0 - so * so, 1e-8));
     float turn = acos(clamp(dot(across, l - so * t) / co, -1.0, 1.0));
     vec3 f = vec3(0.0);
     for (int lobe = 0; lobe < 4; lobe++)
       f += longitudinal(leans.sines[lobe], leans.cosines[lobe], so, co, uVariance[lobe])
         * azimuthal(lobe, ci, turn);
-    sum += seen * power * f;
+    sum += visible * power * f;
   }
   return sum;
 }`;
 
-// What a light sees first in each texel: how deep it lies, and whose strand it is, for a strand does
-// not hide itself. Texels are shifted from one picture to the next, so their mean has none.
+// Shadow map: depth and strand of the first hit in each texel; a strand casts no shadow on itself. Texels
+// are shifted between samples, so that their mean shows none.
 const SHADOW = `
 uniform sampler2D uShadowDepth;
 uniform usampler2D uShadowOf;
@@ -291,8 +291,8 @@ bool hidden(vec3 p, uint mine, float slack) {
 }
 `;
 
-// Indirect light, traced for this view: radiance times coverage by hair (or head), and coverage; its
-// mean where nothing was traced.
+// Indirect light traced for this view: radiance times coverage by hair (or head), and coverage; outside
+// of it the mean.
 const IN_VIEW = `
 uniform vec2 uPart;  // pixels that the view is drawn on
 vec3 between(sampler2D traced, vec3 mean) {
@@ -301,7 +301,7 @@ vec3 between(sampler2D traced, vec3 mean) {
 }
 `;
 
-// Direct light of the hair's BSDF where a fragment lies on its fibre: appearance/bsdf/lobes.py.
+// Near-field direct light of the hair's BSDF at the fragment's offset: appearance/bsdf/lobes.py.
 export const FIBRE_FRAGMENT = FIBRE + LIGHTS + LONGITUDINAL + SHADOW + IN_VIEW + `
 uniform vec4 uSlice, uVariance;
 uniform float uOpacity, uTilt, uEta, uLogistic;
@@ -347,23 +347,23 @@ void main() {
 
 export const LIT_HEAD = LIGHTS + `
 uniform vec3 uSkin;
-vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
+vec3 skin(vec3 p, vec3 n, vec4 visible0, vec4 visible1) {
   vec3 sum = uAmbient * uHeadIndirect;
   for (int i = 0; i < uLights; i++) {
     vec3 l;
     vec3 power = incoming(i, p, l);
-    float seen = i < 4 ? seen0[i] : seen1[i - 4];
-    sum += power * seen * max(dot(n, l), 0.0) / 3.14159265 * uSkin;
+    float visible = i < 4 ? visible0[i] : visible1[i - 4];
+    sum += power * visible * max(dot(n, l), 0.0) / 3.14159265 * uSkin;
   }
   return sum;
 }`;
 
-// The same with the shadow of one light looked up, not taken from the vertices.
+// The same with one light's shadow map instead of visibility per vertex.
 export const SHADOWED_HEAD = LIGHTS + SHADOW + IN_VIEW + `
 uniform vec3 uSkin;
 uniform sampler2D uOfHead;
 uniform float uTexel;  // metres
-vec3 skin(vec3 p, vec3 n, vec4 seen0, vec4 seen1) {
+vec3 skin(vec3 p, vec3 n, vec4 visible0, vec4 visible1) {
   vec3 l, power = incoming(0, p, l);
   float cosine = max(dot(n, l), 0.0);
   bool dark = cosine == 0.0 || hidden(p + 2.0 * uTexel * n, 0xfffffffeu, 2.0 * uTexel);

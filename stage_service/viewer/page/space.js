@@ -1,6 +1,6 @@
-// Matrices (column after column, as WebGL has them) and the camera that turns about the head.
+// Matrices (column-major, as in WebGL) and the orbiting camera.
 
-export const sub = (a, b) => a.map((x, i) => x - b[i]);
+const sub = (a, b) => a.map((x, i) => x - b[i]);
 export const add = (a, b) => a.map((x, i) => x + b[i]);
 export const scale = (a, s) => a.map((x) => x * s);
 export const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
@@ -9,7 +9,7 @@ export const cross = (a, b) => [
 export const length = (a) => Math.hypot(...a);
 export const unit = (a) => scale(a, 1 / (length(a) || 1));
 
-export function product(a, b) {
+function product(a, b) {
   const out = new Float32Array(16);
   for (let c = 0; c < 4; c++)
     for (let r = 0; r < 4; r++)
@@ -22,7 +22,6 @@ export class Pinhole {
   constructor({ R, t, K, width, height, name }) {
     Object.assign(this, { R, t, K, width, height, name });
     this.eye = [0, 1, 2].map((i) => -(R[0][i] * t[0] + R[1][i] * t[1] + R[2][i] * t[2]));
-    this.forward = R[2];
   }
 
   // World to clip; `shift` in pixels of `height` moves the picture, for samples within a pixel.
@@ -48,7 +47,7 @@ export class Pinhole {
     return product(lens, view);
   }
 
-  // The same view in about so many pixels.
+  // The same view in about `pixels` pixels.
   resized(pixels) {
     const s = Math.sqrt(pixels / (this.width * this.height));
     const [width, height] = [this.width, this.height].map((n) => Math.ceil(s * n));
@@ -57,7 +56,7 @@ export class Pinhole {
     return new Pinhole({ ...this, K, width, height });
   }
 
-  // The same view in an image of another shape: the whole of this one fits into it.
+  // The same view, fitted into an image of another shape.
   fitted(width, height) {
     const s = Math.min(width / this.width, height / this.height);
     const K = [[...this.K[0]], [...this.K[1]], [...this.K[2]]];
@@ -68,7 +67,7 @@ export class Pinhole {
   }
 }
 
-// What a light at `eye` sees of a box, `size` pixels a side; with the range of depths to draw.
+// The view of a box from a light at `eye`, `size` pixels a side, with its range of depths.
 export function ofLight(eye, low, high, size) {
   const forward = unit(sub(scale(add(low, high), 0.5), eye));
   const right = unit(cross(forward, Math.abs(forward[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));

@@ -3,12 +3,12 @@
 import { context } from "./gl.js";
 import { Hair, Head } from "./hair.js";
 import * as net from "./net.js";
-import { Controls } from "./controls.js";
+import { Controls, element } from "./controls.js";
 import { Picture } from "./picture.js";
 import { Orbit, Pinhole } from "./space.js";
 
 const $ = (id) => document.getElementById(id);
-const SLOW_MS = 70, FAST_MS = 25;  // fewer strands while a frame takes longer, more when shorter
+const SLOW_MS = 70, FAST_MS = 25;  // a longer frame reduces the number of strands, a shorter one increases it
 
 class Viewer {
   constructor(about) {
@@ -16,16 +16,14 @@ class Viewer {
     this.canvas = $("canvas");
     this.gl = context(this.canvas);
     this.canvas.addEventListener("webglcontextlost", () => {
-      this.status("the graphics card has lost the picture: load the page again");
+      this.status("The graphics card lost the picture. Reload the page.");
       $("status").className = "wrong";
     });
     this.picture = new Picture(this.gl, this.canvas);
     const { low, high } = about.strands.model;
     this.orbit = new Orbit(low, high);
     this.picture.box = { middle: [...this.orbit.target], reach: Math.max(this.orbit.reach, 0.2) };
-    this.busy = 0;
     this.moved = true;
-    this.marks = {};
     new ResizeObserver(() => this.resize()).observe($("stage"));
     this.resize();
     this.hands();
@@ -37,11 +35,10 @@ class Viewer {
     const { clientWidth, clientHeight } = $("stage");
     this.canvas.width = Math.max(1, Math.round(clientWidth * ratio));
     this.canvas.height = Math.max(1, Math.round(clientHeight * ratio));
-    this.ratio = ratio;
     this.draw();
   }
 
-  // Something changed: the next frame is drawn anew.
+  // Redraw in the next frame.
   draw() { this.moved = true; }
 
   view = (width, height) => {
@@ -54,7 +51,7 @@ class Viewer {
     const { picture } = this;
     if (!picture.ready()) return;
     if (this.moved) {
-      if (this.turning) this.pace(picture.took);
+      if (this.turning) this.adaptQuality(picture.took);
       this.moved = false;
       picture.moving(this.view);
       this.restAt = now + (this.turning ? 250 : 60);
@@ -65,18 +62,18 @@ class Viewer {
     }
   }
 
-  pace(took) {
+  adaptQuality(took) {
     const { state } = this.picture;
     if (took > SLOW_MS) state.quality = Math.max(0.1, state.quality * 0.8);
     else if (took < FAST_MS) state.quality = Math.min(1, state.quality * 1.1);
   }
 
   status(text) {
-    if (text !== undefined) this.said = text;
+    if (text !== undefined) this.message = text;
     const { model } = this.picture.sets;
     const here = model && model.here < model.count
       ? `${model.here.toLocaleString("en")} of ${model.count.toLocaleString("en")} strands` : "";
-    $("status").textContent = [here, this.said].filter(Boolean).join(" · ");
+    $("status").textContent = [here, this.message].filter(Boolean).join(" · ");
   }
 
   hands() {
@@ -134,11 +131,10 @@ class Viewer {
   }
 
   async load() {
-    const { about, gl, picture } = this, began = performance.now();
-    const loading = Object.entries(about.strands).map(([name, told]) => {
-      const hair = picture.sets[name] = new Hair(gl, name, told);
+    const { about, gl, picture } = this;
+    const loading = Object.entries(about.strands).map(([name, description]) => {
+      const hair = picture.sets[name] = new Hair(gl, name, description);
       return () => hair.load(() => {
-        if (name === "model") this.marks.first ??= performance.now() - began;
         this.status();
         this.draw();
       });
@@ -147,7 +143,6 @@ class Viewer {
     if (about.head) picture.head = await Head.load(gl);
     this.draw();
     for (const load of loading.slice(1)) await load();
-    this.marks.all = performance.now() - began;
     this.complete = true;
     this.status();
   }
@@ -162,35 +157,25 @@ async function begin() {
     new Controls($("panel"), viewer);
     await viewer.load();
   } catch (error) {
-    if (error instanceof net.Refused) return askForToken(error.message);
+    if (error instanceof net.Refused) return showTokenForm(error.message);
     $("status").textContent = error.message;
     $("status").className = "wrong";
   }
 }
 
 async function choose() {
-  const names = await net.json("/view/models"), panel = $("panel");
-  panel.replaceChildren(Object.assign(document.createElement("h1"), { textContent: "Models" }));
-  for (const name of names) {
-    const link = Object.assign(document.createElement("a"),
-      { textContent: name, href: `/view?model=${encodeURIComponent(name)}` });
-    const line = document.createElement("p");
-    line.append(link);
-    panel.append(line);
-  }
-  if (!names.length) $("status").textContent = "There is no model yet.";
+  const names = await net.json("/view/models");
+  $("panel").replaceChildren(element("h1", { textContent: "Models" }), ...names.map((name) => element("p", {},
+    element("a", { textContent: name, href: `/view?model=${encodeURIComponent(name)}` }))));
+  if (!names.length) $("status").textContent = "No models.";
 }
 
-function askForToken(why) {
-  const form = document.createElement("form");
-  const field = Object.assign(document.createElement("input"),
-    { type: "password", name: "token", autocomplete: "current-password" });
-  field.setAttribute("aria-label", "token");
-  form.append(
-    Object.assign(document.createElement("h1"), { textContent: "A token is needed" }),
-    Object.assign(document.createElement("p"),
-      { textContent: "Yours is printed by: hairstage token show" }), field,
-    Object.assign(document.createElement("button"), { textContent: "Open" }));
+function showTokenForm(why) {
+  const field = element("input",
+    { type: "password", name: "token", autocomplete: "current-password", ariaLabel: "token" });
+  const form = element("form", {}, element("h1", { textContent: "Log in" }),
+    element("p", { textContent: "hairstage token show prints your token." }), field,
+    element("button", { textContent: "Open" }));
   form.addEventListener("submit", async (e) => {
     e.preventDefault();
     try {

@@ -1,6 +1,6 @@
 // Actions shared by all views.
 
-import { ask, captureAt } from "./ask.js";
+import { captureAt, request } from "./api.js";
 import { button, h, seconds } from "./dom.js";
 import { S, busy, load, refused, takeLease, unlit } from "./state.js";
 
@@ -13,14 +13,14 @@ export function notice(text, kind = "") {
   setTimeout(() => made.remove(), kind === "bad" ? 15_000 : 6000);
 }
 
-const LEFT = new Error("left without a name");
+const CANCELLED = new Error("cancelled");
 
-/** Do what a button is for; a refusal is shown. */
+/** Run `work`; show a notice if it fails. */
 export async function attempt(work) {
   try {
     return await work();
   } catch (error) {
-    if (error === LEFT) return undefined;
+    if (error === CANCELLED) return undefined;
     notice(error.status === 401 ? "Log in again." : error.message, "bad");
     return undefined;
   }
@@ -29,51 +29,52 @@ export async function attempt(work) {
 export async function abort() {
   if (!busy()) return notice("No capture is running.");
   const { id } = S.capture;
-  await attempt(() => ask(`POST ${captureAt(id)}/abort`));
+  await attempt(() => request(`POST ${captureAt(id)}/abort`));
   return load.capture(id).catch(() => {});
 }
 
-export function left(c) {
+export function timeLeft(c) {
   if (c.state === "aborting") return "ends after this step";
-  if (c.state === "finishing") return "nothing more is lit";
+  if (c.state === "finishing") return "writes the last frames";
   if (c.state === "paused") return "lights off";
   const s = c.progress?.seconds_left;
-  return s === null || s === undefined ? "time left: not known yet" : `${seconds(s)} left`;
+  return s === null || s === undefined ? "time left: unknown" : `${seconds(s)} left`;
 }
 
-/** Who steers, as the others see it. Raises `LEFT` where nobody says. */
-export async function askName() {
+/** The name that other operators see. Raises `CANCELLED` if the person enters none. */
+export async function operatorName() {
   const known = (localStorage.getItem("name") ?? S.who?.name ?? "").trim();
   if (known) return known;
-  const name = await nameIn("Your name, as the others see it", "Steer");
+  const name = await promptName("Your name, as other operators see it", "Steer");
   localStorage.setItem("name", name);
   return name;
 }
 
-/** A name that the person types. Raises `LEFT` where they type none. */
-export async function nameIn(label, go) {
+/** A name from a dialog. Raises `CANCELLED` if the person closes it. */
+export async function promptName(label, go) {
   const field = h("input", { name: "holder", required: true, maxlength: 100, pattern: ".*\\S.*", title: "a name", autocomplete: "name" });
   await confirmed(label, [h("label", label, field)], go);
   return field.value.trim();
 }
 
-/** Returns once the person has confirmed `content` by the button `go`. Raises `LEFT` where they have not. Not modal, and
- * not the browser's own, which would keep them from Blackout. */
+/** Resolves when the person confirms `content` by the button `go`; raises `CANCELLED` otherwise. Not modal, unlike the
+ * browser's own dialogs: Blackout stays within reach. */
 export function confirmed(label, content, go) {
-  return new Promise((done, left_) => {
+  return new Promise((done, cancel) => {
     const box = h("dialog", { "aria-label": label, onkeydown: (event) => { if (event.key === "Escape") box.close(); } }, h("form", { onsubmit: (event) => {
       event.preventDefault();
       done();
       box.close();
     } }, content, h(".line", h("button.go", go), button("Cancel", () => box.close()))));
-    box.addEventListener("close", () => { box.remove(); left_(LEFT); }); // nothing, after `done`
+    box.addEventListener("close", () => { box.remove(); cancel(CANCELLED); }); // no effect after `done`
     for (const other of document.querySelectorAll("dialog")) other.close();
     document.body.append(box);
     box.show();
   });
 }
 
-/** A button that steers: disabled, with the reason as its title, while this page may not; `lights`: it has lamps lit. */
+/** A button for an action that needs the lease: disabled, with the reason as its title, while this page may not steer.
+ * `lights`: the action lights lamps. */
 export function steering(text, work, { ready = () => true, lights = false, ...more } = {}) {
   const made = button(text, () => attempt(work), more);
   return {
@@ -86,7 +87,7 @@ export function steering(text, work, { ready = () => true, lights = false, ...mo
   };
 }
 
-/** Steer alone from here on, unless this page does so already. */
+/** Take the lease, unless this page holds it. */
 export async function underLease() {
-  await takeLease(await askName());
+  await takeLease(await operatorName());
 }

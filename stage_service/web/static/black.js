@@ -1,4 +1,4 @@
-// A black screen that does not light the subject; a key, a touch or an alarm ends it.
+// A black screen, which does not light the subject. A key, a touch or an alarm closes it.
 
 import { h } from "./dom.js";
 import { pressed } from "./blackout.js";
@@ -10,7 +10,7 @@ export function blackScreen() {
   if (cover) return end();
   const before = document.activeElement;
   const word = h("p", "");
-  cover = h(".black", { role: "dialog", "aria-label": "black screen: any key or a touch ends it", tabindex: "0" }, word);
+  cover = h(".black", { role: "dialog", "aria-label": "black screen: press a key or touch to close", tabindex: "0" }, word);
   cover.before_ = before;
   cover.addEventListener("pointerdown", end);
   cover.addEventListener("keydown", (event) => {
@@ -23,7 +23,7 @@ export function blackScreen() {
   const was = busy();
   const stop = onChange(() => {
     word.textContent = busy() && S.capture.state === "running" ? `${S.capture.step} / ${S.capture.steps}` : "";
-    if (S.out || silence() || pressed?.going || S.health?.latch || S.failed || (was && !busy())) end();
+    if (S.loggedOut || silence() || pressed?.going || S.health?.latch || S.failed || (was && !busy())) end();
   });
   cover.stop = stop;
   return undefined;

@@ -1,12 +1,12 @@
 // Snapshots: one exposure, or one every few seconds.
 
 import { attempt, steering } from "./acts.js";
-import { ask, get } from "./ask.js";
-import { h, numberIn, say, seconds } from "./dom.js";
+import { get, request } from "./api.js";
+import { h, numberIn, seconds, setContent } from "./dom.js";
 import { pictures } from "./pictures.js";
-import { S, busy, events } from "./state.js";
+import { S, busy, onEvents } from "./state.js";
 
-let last = null; // the step that is shown, and when it was begun
+let last = null; // the displayed step; `of`: when it started
 
 export function open(view) {
   const controller = new AbortController();
@@ -18,7 +18,7 @@ export function open(view) {
   const marked = h("input", { type: "checkbox", checked: true, onchange: show });
   const figures = h("input", { type: "checkbox", checked: true, onchange: show });
   const take = steering("Take a snapshot", shoot, { kind: "go", lights: true, ready: () => !busy() });
-  const what = h("p.quiet", "A snapshot lights the stage for one exposure. It is kept until the next one and is not listed among the captures.");
+  const what = h("p.quiet", "A snapshot lights the stage for one exposure. The service keeps it until the next one and does not list it as a capture.");
   const grid = h(".grid");
   const cells = pictures(grid, controller.signal);
   view.append(h("h1", "Cameras"),
@@ -36,14 +36,14 @@ export function open(view) {
   }
 
   async function shoot() {
-    await ask("POST /snapshot", { light: light.value || null, exposure: numberIn(exposure), level: numberIn(level) });
+    await request("POST /snapshot", { light: light.value || null, exposure: numberIn(exposure), level: numberIn(level) });
   }
 
   async function look() {
     const [c, steps] = await Promise.all([get("/captures/snapshot", { signal: controller.signal }), get("/captures/snapshot/steps", { signal: controller.signal })]);
     if (c.state !== "done") return;
     last = { ...steps[0], of: c.started };
-    say(what, `${last.light ?? "all lights"}, ${seconds(last.exposure)}, level ${last.level}${c.outcome === "completed" ? "" : `: ${c.error ?? c.outcome}`}`);
+    setContent(what, `${last.light ?? "all lights"}, ${seconds(last.exposure)}, level ${last.level}${c.outcome === "completed" ? "" : `: ${c.error ?? c.outcome}`}`);
     show();
   }
 
@@ -58,15 +58,14 @@ export function open(view) {
     if (Number(again.value)) timer = setTimeout(repeat, 1000 * again.value);
   }
 
-  /** Not while nobody looks, nor while a capture is made or somebody else steers: those come first. */
+  /** Skipped while the page is hidden, a capture runs or another operator steers. */
   async function repeat() {
     if (!document.hidden && !take.element.disabled && !cells.busy) await attempt(shoot);
     plan();
   }
 
-  const onOver = ({ detail }) => { if (detail.id === "snapshot") look().catch(() => {}); };
-  events.addEventListener("capture.over", onOver);
+  const stop = onEvents(["capture.over"], ({ detail }) => { if (detail.id === "snapshot") look().catch(() => {}); });
   hints();
-  if (last) look().catch(() => {}); // the service may have forgotten it since
-  return { update: take.update, end() { clearTimeout(timer); controller.abort(); events.removeEventListener("capture.over", onOver); } };
+  if (last) look().catch(() => {}); // the service may have removed it
+  return { update: take.update, end() { clearTimeout(timer); controller.abort(); stop(); } };
 }

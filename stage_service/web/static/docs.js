@@ -1,6 +1,6 @@
 // The API on a page, from /openapi.json: each route, its fields, and a command line that calls it.
 
-import { h, say } from "./dom.js";
+import { h, setContent } from "./dom.js";
 
 const view = document.getElementById("view");
 
@@ -32,12 +32,12 @@ function operation(method, path, op, api) {
   const example = body && schemaOf(body, api).examples?.[0];
   const line = `curl ${method === "GET" ? "" : `-X ${method} `}${location.origin}${path} -H "Authorization: Bearer $(hairstage token show)"${body ? ` \\\n     -H 'content-type: application/json' -d '${JSON.stringify(example ?? {})}'` : ""}`;
   const good = Object.entries(op.responses).find(([code]) => code.startsWith("2"));
-  const answer = good?.[1].content?.["application/json"]?.schema;
+  const response = good?.[1].content?.["application/json"]?.schema;
   return h("details", { id: op.operationId }, h("summary", h("code", h("b", method), ` ${path}`), h("span.quiet", ` ${op.description?.split(/\.\s/)[0] ?? op.summary ?? ""}`)),
     h("p", op.description),
     op.parameters?.length ? h("table", h("tbody", op.parameters.map((p) => h("tr", h("th", { scope: "row" }, h("code", p.name)), h("td", p.in), h("td", kind(p.schema)), h("td", p.description ?? ""))))) : "",
     body ? [h("h3", "request body"), fieldsOf(body, api)] : "",
-    answer ? [h("h3", `response ${good[0]}`), fieldsOf(answer.type === "array" ? answer.items : answer, api)] : "",
+    response ? [h("h3", `response ${good[0]}`), fieldsOf(response.type === "array" ? response.items : response, api)] : "",
     h("pre", { tabindex: "0" }, h("code", line)));
 }
 
@@ -51,8 +51,8 @@ try {
       groups.get(tag).push(operation(method.toUpperCase(), path, op, api));
     }
   }
-  say(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route except the open ones needs a token. Problem types are ", h("a", { href: "/docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "/openapi.json" }, "openapi.json"), ". The ", h("a", { href: "/" }, "console"), "."),
+  setContent(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route except the open ones needs a token. Problem types are ", h("a", { href: "/docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "/openapi.json" }, "openapi.json"), ". The ", h("a", { href: "/" }, "console"), "."),
     ...[...groups].map(([tag, rows]) => h("section.api", { "aria-label": tag }, h("h2", tag), rows)));
 } catch (error) {
-  say(view, h("p.bad", `/openapi.json: ${error.message}`));
+  setContent(view, h("p.bad", `/openapi.json: ${error.message}`));
 }

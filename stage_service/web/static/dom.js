@@ -1,6 +1,6 @@
 // Elements, and formatting of numbers.
 
-/** An element: `h("p.quiet", {title}, "text", child)`. Attributes that begin with "on" listen. */
+/** An element: `h("p.quiet", {title}, "text", child)`. Attributes that begin with "on" add event listeners. */
 export function h(name, attributes, ...children) {
   if (attributes === undefined || attributes === null || attributes instanceof Node
       || typeof attributes !== "object" || Array.isArray(attributes)) {
@@ -36,22 +36,22 @@ function put(made, children) {
   return made;
 }
 
-/** Replace what is in `parent`, unless it is the same text. */
-export function say(parent, ...children) {
+/** Replace the content of `parent`, unless it is the same text. */
+export function setContent(parent, ...children) {
   const text = children.length === 1 && !(children[0] instanceof Node) ? String(children[0] ?? "") : null;
   if (text !== null && parent.childElementCount === 0 && parent.textContent === text) return;
   parent.replaceChildren();
   put(parent, children);
 }
 
-/** Rows by key: those that stay are told what is new, so that focus and scroll stay, too. */
+/** Rows by key: existing rows are updated in place, which keeps focus and scroll position. */
 export function keyed(parent, items, key, make) {
   const before = parent._rows ?? new Map();
   const rows = new Map();
   for (const item of items) {
     const id = key(item);
     const row = before.get(id) ?? make(item);
-    row.tell?.(item);
+    row.update?.(item);
     rows.set(id, row);
   }
   for (const [id, row] of before) if (!rows.has(id)) row.element.remove();
@@ -67,6 +67,9 @@ export function button(text, onclick, more = {}) {
   const { kind = "", ...rest } = more;
   return h(`button${kind ? "." + kind : ""}`, { type: "button", onclick, ...rest }, text);
 }
+
+/** Rows of a definition list, from {name: value}. */
+export const definitions = (rows) => Object.entries(rows).map(([name, value]) => h("div", h("dt", name), h("dd", value)));
 
 export function seconds(s) {
   if (s === null || s === undefined) return "–";
@@ -85,14 +88,14 @@ export function bytes(n) {
   return `${n} B`;
 }
 
-/** What a field of numbers says: undefined where it is empty, and where it is no number a text, for the API to
- * refuse: a browser shows "1e" and "0,5", and calls them empty. */
+/** The value of a number field: undefined if empty; a text, which the API refuses, if invalid: browsers report "1e" and
+ * "0,5" as empty. */
 export function numberIn(input) {
   if (input.validity.badInput) return "no number";
   return input.value === "" ? undefined : Number(input.value);
 }
 
-/** Three digits that count, thousands apart. */
+/** Three significant digits, thousands separated. */
 export function number(n) {
   if (n === null || n === undefined || !Number.isFinite(n)) return "–";
   if (Number.isInteger(n)) return n.toLocaleString("en");
@@ -102,7 +105,7 @@ export function number(n) {
 
 export const percent = (share) => `${(100 * share).toFixed(share < 0.1 && share > 0 ? 1 : 0)} %`;
 
-/** A time of today as such, another with its day. */
+/** A local time; with its date unless that is today. */
 export function clock(iso) {
   if (!iso) return "–";
   const at = new Date(iso);
@@ -110,10 +113,10 @@ export function clock(iso) {
   return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString("sv")} ${time}`;
 }
 
-/** A sentence of the service, with its times (ISO 8601, or a date and a time in UTC) as this machine's clock has them. */
+/** A message of the service with its times (ISO 8601, or date and time in UTC) in local time. */
 export const local = (text) => (text ?? "")
   .replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)/g, (iso) => clock(iso))
   .replace(/(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC/g, (_, day, time) => clock(`${day}T${time}Z`));
 
-/** A name of the API in words, with its unit after a comma. */
+/** An API name as a label: "square_mm" becomes "square, mm". */
 export const words = (name) => name.replace(/_(mm|px|deg|s|hz)$/, (_, unit) => `, ${unit === "hz" ? "Hz" : unit}`).replaceAll("_", " ");

@@ -9,10 +9,10 @@ const place = ([x, y, z]) => {
   return [(r * x) / flat, (-r * y) / flat];
 };
 
-/** A picture of `rig`; `onpick(name)` makes its lights be chosen by a click.
+/** A picture of `rig`; `onpick(name)` is called when a light is clicked.
  *
- * `show({lit, shot, missing, chosen, doubt, projector})`: the light that is lit ("all" for all), sets of names of
- * those that were shot, lack frames, are chosen, may be lit, and the projector that is on. */
+ * `show({lit, shot, missing, chosen, doubt, projector})`: the lit light ("all" for all); sets of names of lights that were
+ * captured, lack frames, are selected, may be lit; the projector that is on. */
 export function dome(rig, { onpick = null, label = "" } = {}) {
   const lights = new Map();
   const radius = Math.min(0.05, 0.62 / Math.sqrt(rig.lights.length));

@@ -4,7 +4,7 @@ import { h, numberIn, words } from "./dom.js";
 
 const plain = (value) => (value === undefined || value === null ? "" : Array.isArray(value) ? value.join(", ") : String(value));
 
-/** `{element, value(), fill(value)}` of an object's schema; `hints[path]` says what empty means. */
+/** `{element, value(), fill(value)}` of an object's schema; `hints[path]` is the placeholder of an empty field. */
 export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
   const fields = [];
   const groups = [h(".fields")];
@@ -60,7 +60,7 @@ export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
       const input = h("input", { type: "number", step: kind.type === "integer" ? 1 : "any", min: kind.minimum ?? kind.exclusiveMinimum, max: kind.maximum, placeholder: hint ?? (kind.default ?? "") });
       return { input, read: () => numberIn(input), write: (v) => { input.value = v ?? ""; } };
     }
-    // Names, numbers with commas, or a text: what the API makes of it, it says itself.
+    // Names, numbers with commas, or a text: the API validates them.
     const many = (kind.kinds ?? [kind]).find((x) => x.type === "array");
     const items = many && (many.items ?? many.prefixItems?.[0]);
     const input = h("input", { type: "text", placeholder: hint ?? plain(kind.default), spellcheck: false, autocomplete: "off" });

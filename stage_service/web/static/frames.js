@@ -1,16 +1,16 @@
 // Captures and their frames, by camera and by light.
 
 import { attempt } from "./acts.js";
-import { captureAt, get } from "./ask.js";
-import { button, clock, h, keyed, number, say, seconds } from "./dom.js";
+import { captureAt, get } from "./api.js";
+import { button, clock, definitions, h, keyed, number, seconds, setContent } from "./dom.js";
 import { pictures } from "./pictures.js";
-import { S, events } from "./state.js";
+import { S, onEvents } from "./state.js";
 
 const PAGE = 50;
 const FILM_MS = 120;
 const LISTED = ["capture.state", "capture.over", "capture.removed", "capture.restored", "captures.read", "fresh"];
 
-export function open(view, [asked]) {
+export function open(view, [requestedId]) {
   const list = h(".list", { role: "group", "aria-label": "captures" });
   const older = button("older", () => turn(PAGE), { kind: "quiet" });
   const newer = button("newer", () => turn(-PAGE), { kind: "quiet" });
@@ -33,19 +33,18 @@ export function open(view, [asked]) {
     keyed(list, found.reverse(), (c) => c.id, (c) => {
       const name = h("span");
       const element = h("button", { type: "button", onclick: () => choose(c.id) }, name);
-      return { element, tell(x) { say(name, x.id, h("br"), h(`small${x.outcome === "failed" || x.outcome === "damaged" ? ".bad" : ""}`, `${x.outcome ?? x.state}, ${number(x.frames_written)} of ${number(x.frames_planned)} frames`)); element.dataset.id = x.id; } };
+      return { element, update(x) { setContent(name, x.id, h("br"), h(`small${x.outcome === "failed" || x.outcome === "damaged" ? ".bad" : ""}`, `${x.outcome ?? x.state}, ${number(x.frames_written)} of ${number(x.frames_planned)} frames`)); element.dataset.id = x.id; } };
     });
-    if (!found.length) say(list, h("p.quiet", offset ? "No older captures." : "No captures."));
+    if (!found.length) setContent(list, h("p.quiet", offset ? "No older captures." : "No captures."));
     newer.disabled = offset === 0;
     older.disabled = found.length < PAGE;
     mark();
-    if (!shown && (asked || found.length)) choose(asked ?? found[0].id);
+    if (!shown && (requestedId || found.length)) choose(requestedId ?? found[0].id);
   }
 
   function mark() {
     for (const row of list.querySelectorAll("button")) {
-      if (row.dataset.id === shown?.id) row.setAttribute("aria-current", "true");
-      else row.removeAttribute("aria-current");
+      row.ariaCurrent = row.dataset.id === shown?.id ? "true" : null;
     }
   }
 
@@ -56,17 +55,17 @@ export function open(view, [asked]) {
     mark();
   }
 
-  function onChange({ type, detail: told }) {
-    if (type === "capture.removed" && told.id === shown?.id) {
+  function onChange({ type, detail: capture }) {
+    if (type === "capture.removed" && capture.id === shown?.id) {
       shown.stop();
-      shown = asked = null;
+      shown = requestedId = null;
       detail.replaceChildren();
     }
     loadList();
   }
-  for (const kind of LISTED) events.addEventListener(kind, onChange);
+  const stop = onEvents(LISTED, onChange);
   loadList();
-  return { end() { for (const kind of LISTED) events.removeEventListener(kind, onChange); shown?.stop(); }, update() { shown?.update(); } };
+  return { end() { stop(); shown?.stop(); }, update() { shown?.update(); } };
 }
 
 function captureOf(view, id) {
@@ -98,22 +97,22 @@ function captureOf(view, id) {
       const more = { signal: controller.signal };
       [status, steps] = await Promise.all([get(captureAt(id), more), get(`${captureAt(id)}/steps`, more)]);
     } catch (error) {
-      if (!controller.signal.aborted) say(facts, h("p.bad", error.message));
+      if (!controller.signal.aborted) setContent(facts, h("p.bad", error.message));
       return;
     }
-    tell();
+    showFacts();
     if (!steps.some((s) => s.kind === kinds.value)) kinds.value = steps.some((s) => s.kind === "scanline") ? "scanline" : "all";
     pick();
   }
 
-  function tell() {
+  function showFacts() {
     const c = status;
-    const rows = { "State": c.outcome ?? c.state, "Begun": clock(c.started), "Took": seconds(c.seconds), "Steps": number(c.steps), "Frames": `${number(c.frames_written)} of ${number(c.frames_planned)}`, "Missing": number(c.frames_missing) };
-    facts.replaceChildren(...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
-    if (c.error) facts.append(h("div", h("dt", "Error"), h("dd.bad", c.error)));
+    const rows = { "State": c.outcome ?? c.state, "Started": clock(c.started), "Duration": seconds(c.seconds), "Steps": number(c.steps), "Frames": `${number(c.frames_written)} of ${number(c.frames_planned)}`, "Missing": number(c.frames_missing) };
+    if (c.error) rows.Error = h("span.bad", c.error);
+    setContent(facts, definitions(rows));
     acts.replaceChildren(
       h("a.button", { href: `${captureAt(id)}/archive.tar`, download: "" }, "Download"),
-      c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Its job") : "",
+      c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Job") : "",
     );
   }
 
@@ -121,7 +120,7 @@ function captureOf(view, id) {
     stopFilm();
     chosen = steps.filter((s) => s.lacks.length < S.rig.cameras.length && (kinds.value === "all" || s.kind === kinds.value));
     slider.disabled = chosen.length < 2;
-    if (!chosen.length) say(where, "no frames of these steps yet");
+    if (!chosen.length) setContent(where, "no frames of these steps yet");
     slider.max = Math.max(0, chosen.length - 1);
     slider.value = Math.min(slider.value, slider.max);
     white = null;
@@ -131,9 +130,9 @@ function captureOf(view, id) {
 
   function toggleFilm() {
     if (film) return stopFilm();
-    say(play, "stop");
+    setContent(play, "stop");
     film = setInterval(() => {
-      if (shown.busy) return; // no faster than pictures come
+      if (shown.busy) return; // the next frame waits for the images of this one
       slider.value = (Number(slider.value) + 1) % chosen.length;
       show();
     }, FILM_MS);
@@ -143,7 +142,7 @@ function captureOf(view, id) {
   function stopFilm() {
     clearInterval(film);
     film = 0;
-    say(play, "film");
+    setContent(play, "film");
   }
 
   const words = (s) => ({ olat: s.light, scanline: `${s.projector}, row ${s.row}`, all_on: "all lights", tracking: "all projectors" }[s.kind] ?? "dark");
@@ -151,7 +150,7 @@ function captureOf(view, id) {
   async function show() {
     const step = chosen[slider.value];
     if (!step) return;
-    say(where, `${words(step)} · step ${step.index}${step.exposure ? ` · ${seconds(step.exposure)}` : ""}`);
+    setContent(where, `${words(step)} · step ${step.index}${step.exposure ? ` · ${seconds(step.exposure)}` : ""}`);
     slider.setAttribute("aria-valuetext", words(step));
     if (same.checked && white === null) await exposure();
     shown.show((camera) => `${captureAt(id)}/frames/${step.index}/${encodeURIComponent(camera)}`, {
@@ -160,7 +159,7 @@ function captureOf(view, id) {
     });
   }
 
-  /** What is white in all of them: the brightest of a few frames, of one camera. */
+  /** The white level for all frames: the brightest of five frames of the first camera. */
   async function exposure() {
     white = 0;
     const some = [0.1, 0.3, 0.5, 0.7, 0.9].map((at) => chosen[Math.floor(at * chosen.length)]);

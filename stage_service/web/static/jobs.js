@@ -1,11 +1,11 @@
 // Jobs: progress, error against time, warnings and files.
 
 import { attempt } from "./acts.js";
-import { ask, get } from "./ask.js";
-import { button, bytes, clock, h, keyed, local, number, percent, say, seconds, svg, words } from "./dom.js";
-import { S, changed, events, load } from "./state.js";
+import { get, request } from "./api.js";
+import { button, bytes, clock, definitions, h, keyed, local, number, percent, seconds, setContent, svg, words } from "./dom.js";
+import { S, changed, load, onEvents } from "./state.js";
 
-export function open(view, [asked]) {
+export function open(view, [requestedId]) {
   const list = h(".list", { role: "group", "aria-label": "jobs" });
   const none = h("p.quiet");
   const detail = h("section");
@@ -21,17 +21,17 @@ export function open(view, [asked]) {
   }
 
   function update() {
-    say(none, S.jobsProblem ?? (S.jobs?.length ? "" : "No jobs. A capture whose plan names a pipeline enqueues one when it is complete."));
+    setContent(none, S.jobsProblem ?? (S.jobs?.length ? "" : "No jobs. A capture whose plan names a pipeline enqueues one when it is complete."));
     keyed(list, S.jobs ?? [], (j) => j.id, (j) => {
       const name = h("span");
       const share = h("progress", { max: 1, "aria-label": "done" });
-      return { element: h("button", { type: "button", onclick: () => choose(j.id) }, name, share), tell(x) {
-        say(name, `${x.pipeline} `, h("br"), h(`small${x.outcome === "failed" ? ".bad" : ""}`, `${x.outcome ?? x.state}${x.progress && x.state === "running" ? `: ${words(x.progress.step)}` : ""} · ${clock(x.created)}`));
+      return { element: h("button", { type: "button", onclick: () => choose(j.id) }, name, share), update(x) {
+        setContent(name, `${x.pipeline} `, h("br"), h(`small${x.outcome === "failed" ? ".bad" : ""}`, `${x.outcome ?? x.state}${x.progress && x.state === "running" ? `: ${words(x.progress.step)}` : ""} · ${clock(x.created)}`));
         share.hidden = x.state !== "running";
         share.value = x.progress?.share ?? 0;
       } };
     });
-    if (!shown && (asked || S.jobs?.length)) choose(asked ?? S.jobs[0].id);
+    if (!shown && (requestedId || S.jobs?.length)) choose(requestedId ?? S.jobs[0].id);
     shown?.update();
   }
   return { update, end: () => shown?.stop() };
@@ -41,7 +41,7 @@ function jobOf(view, id) {
   const facts = h("dl.facts");
   const title = h("h2.title", id);
   const wrong = h("p.bad");
-  const what = h("p.said");
+  const what = h("p.status");
   const meter = h("progress", { max: 1, "aria-label": "done" });
   const acts = h(".line");
   const curves = h(".grid");
@@ -56,7 +56,7 @@ function jobOf(view, id) {
   let measured = "";
 
   const onEvent = ({ detail }) => { if (detail.job === id) refresh(); };
-  for (const kind of ["job.state", "job.progress"]) events.addEventListener(kind, onEvent);
+  const stop = onEvents(["job.state", "job.progress"], onEvent);
 
   async function refresh() {
     const known = S.jobs?.find((j) => j.id === id) ?? await attempt(() => get(`/jobs/${id}`));
@@ -65,7 +65,7 @@ function jobOf(view, id) {
     update();
   }
 
-  /** What has come of it, once after each step and at its end. */
+  /** Load report and files, once after each step and at the end. */
   async function look() {
     const step = `${job.state}/${job.outcome}/${job.progress?.step}`;
     if (step === last) return;
@@ -75,7 +75,7 @@ function jobOf(view, id) {
     if (step === last) filesOf(list);
   }
 
-  /** How long the rest takes, by what the share that is done took. */
+  /** Seconds left, extrapolated from the completed share. */
   function timeLeft() {
     const share = job.progress?.share ?? 0;
     if (job.state !== "running" || !job.started || share < 0.02) return null;
@@ -88,13 +88,13 @@ function jobOf(view, id) {
     const p = job.progress;
     const rows = {
       "Pipeline": job.pipeline, "State": job.outcome ?? job.state, "Capture": job.capture.split("/").at(-1), "Model": job.model.split("/").at(-1),
-      "Begun": clock(job.started), "Took": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
+      "Started": clock(job.started), "Duration": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
       ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}, if all steps take equally long` } : {}),
     };
-    say(facts, ...Object.entries(rows).map(([k, v]) => h("div", h("dt", k), h("dd", v))));
-    say(wrong, job.error ? `${local(job.error.detail)} (${job.error.type})` : "");
+    setContent(facts, definitions(rows));
+    setContent(wrong, job.error ? `${local(job.error.detail)} (${job.error.type})` : "");
     wrong.hidden = !job.error;
-    say(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "Queued until a worker is free." : "");
+    setContent(what, job.state === "running" && p ? `${words(p.step)} (${p.steps.indexOf(p.step) + 1} of ${p.steps.length}): ${p.what}` : job.state === "queued" ? "Queued until a worker is free." : "");
     meter.hidden = job.state !== "running";
     what.hidden = job.state === "done";
     look().catch(() => { last = ""; });
@@ -105,7 +105,7 @@ function jobOf(view, id) {
     if (acts.dataset.key === key) return;
     acts.dataset.key = key;
     acts.replaceChildren(
-      ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await ask(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
+      ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await request(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
       ...(job.state === "done" && job.outcome !== "succeeded" && may ? [button("Run it again", () => attempt(again))] : []),
       h("a.button", { href: `/view#model=${encodeURIComponent(job.model.split("/").at(-1))}` }, "View the strands"),
       h("a.button", { href: `/models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
@@ -113,7 +113,7 @@ function jobOf(view, id) {
   }
 
   async function again() {
-    const made = await ask("POST /jobs", { capture: job.capture.split("/").at(-1), model: job.model.split("/").at(-1), pipeline: { name: job.pipeline, options: job.options, priority: job.priority, retries: job.retries, timeout_s: job.timeout_s } });
+    const made = await request("POST /jobs", { capture: job.capture.split("/").at(-1), model: job.model.split("/").at(-1), pipeline: { name: job.pipeline, options: job.options, priority: job.priority, retries: job.retries, timeout_s: job.timeout_s } });
     await load.jobs();
     location.hash = `#jobs/${made.id}`;
     location.reload();
@@ -138,10 +138,10 @@ function jobOf(view, id) {
   }
 
   refresh();
-  return { update, stop() { for (const kind of ["job.state", "job.progress"]) events.removeEventListener(kind, onEvent); } };
+  return { update, stop };
 }
 
-/** Error against run time, both from 0 or by powers of ten where it spans more than one. */
+/** Error over run time; logarithmic if the error spans more than a factor of 10. */
 function curve(title, series) {
   const points = series.points.filter(([, e]) => Number.isFinite(e));
   const [width, height, pad] = [340, 170, 60];
@@ -154,10 +154,10 @@ function curve(title, series) {
   const x = (t) => pad + ((width - pad - 12) * t) / end;
   const y = (e) => height - 26 - ((height - 44) * (f(e) - low)) / (high - low || 1);
   const [first, final] = [errors[0], errors.at(-1)].map((e) => Math.min(height - 28, y(e) + 4));
-  const apart = Math.abs(first - final) < 12 ? (first < final ? -6 : 6) : 0; // so that neither number covers the other
+  const apart = Math.abs(first - final) < 12 ? (first < final ? -6 : 6) : 0; // keeps the two labels apart
   const text = (at, up, words_, anchor) => svg("text", { x: at, y: up, "text-anchor": anchor }, words_);
-  const said = `${title}: ${series.error} ${number(errors[0])} at the start, ${number(errors.at(-1))} after ${seconds(points.at(-1)[0])}`;
-  return h("figure", svg("svg", { class: "curve", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": said },
+  const description = `${title}: ${series.error} ${number(errors[0])} at the start, ${number(errors.at(-1))} after ${seconds(points.at(-1)[0])}`;
+  return h("figure", svg("svg", { class: "curve", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": description },
     svg("path", { class: "axis", d: `M${pad} 12V${height - 26}H${width - 8}` }),
     svg("path", { class: "data", d: `M${points.map(([t, e]) => `${x(t).toFixed(1)} ${y(e).toFixed(1)}`).join("L")}` }),
     text(pad - 5, first + apart, number(errors[0]), "end"), text(pad - 5, final - apart, number(errors.at(-1)), "end"),

@@ -1,10 +1,10 @@
 // The frame around every view: state, alarms, abort and blackout.
 
-import { abort, askName, attempt, left, notice } from "./acts.js";
+import { abort, attempt, notice, operatorName, timeLeft } from "./acts.js";
 import { alarmBox } from "./alarms.js";
-import { service, tell } from "./ask.js";
+import { emit, service } from "./api.js";
 import { blackout, pressed, resend, resume } from "./blackout.js";
-import { button, clock, h, say, seconds } from "./dom.js";
+import { button, clock, h, seconds, setContent } from "./dom.js";
 import { contradicts, lampWords } from "./lamps.js";
 import { loginForm } from "./login.js";
 import { S, begin, busy, changed, load, mine, onChange, releaseLease, silence, takeLease } from "./state.js";
@@ -27,7 +27,7 @@ const top = document.getElementById("top");
 const view = document.getElementById("view");
 let shown = null;
 
-// Keys work in every view, fields and the login form included.
+// Keys work in every view, also in fields and in the login form.
 addEventListener("keydown", (event) => {
   const action = { F7: blackScreen, F8: abort, F9: blackout }[event.key];
   if (!action) return;
@@ -35,9 +35,9 @@ addEventListener("keydown", (event) => {
   action();
 });
 
-/** Where the stage is, in a word, and its tone. */
+/** The state of the stage in a word, and its tone. */
 function stateWord() {
-  if (S.out) return ["not logged in", "bad"];
+  if (S.loggedOut) return ["not logged in", "bad"];
   if (S.connected === null) return ["connecting", ""];
   if (document.hidden) return ["not followed", ""];
   const lamps = lampWords(S.health);
@@ -46,7 +46,7 @@ function stateWord() {
 }
 
 function bar() {
-  const state = h("strong.state", { role: "status" }); // steps and seconds beside it would be read out four times a second
+  const state = h("strong.state", { role: "status" }); // the changing steps and seconds stay outside of it: screen readers would repeat them
   const detail = h("span.detail");
   const steering = h("span.steering");
   const links = Object.entries(VIEWS).map(([name, [title]]) => h("a", { href: `#${name}` }, title));
@@ -54,39 +54,37 @@ function bar() {
   const label = h("span");
   const held = button("", () => attempt(async () => {
     if (mine()) await releaseLease();
-    else await takeLease(await askName());
+    else await takeLease(await operatorName());
   }), { kind: "quiet" });
   const who = h(".who", steering, held);
-  const stop = button("Abort", abort, { kind: "abort", "aria-keyshortcuts": "F8", title: "end at the next step, keep the frames (F8)" });
-  const dark = button("", blackout, { kind: "blackout", "aria-keyshortcuts": "F9", title: "every lamp and projector off at once, read back where the device can (F9)" });
+  const stop = button("Abort", abort, { kind: "abort", "aria-keyshortcuts": "F8", title: "stop after this step, keep the frames (F8)" });
+  const dark = button("", blackout, { kind: "blackout", "aria-keyshortcuts": "F9", title: "switch every lamp and projector off at once, with read-back if supported (F9)" });
   const black = button("", blackScreen, { kind: "quiet", "aria-keyshortcuts": "F7", title: "turn this screen black (F7)" });
-  say(black, "Black", h("kbd", "F7"));
-  say(stop, "Abort", h("kbd", "F8"));
-  say(dark, label, h("kbd", "F9"));
+  setContent(black, "Black", h("kbd", "F7"));
+  setContent(stop, "Abort", h("kbd", "F8"));
+  setContent(dark, label, h("kbd", "F9"));
   top.replaceChildren(h(".where", state, detail), views, who, h(".stops", black, stop, dark));
   return () => {
     const c = S.capture;
     const silent = silence();
     const [word, tone] = stateWord();
-    say(state, word);
+    setContent(state, word);
     state.className = `state ${tone}`;
     const rig = S.rig?.name ?? "";
-    say(detail, S.out ? "" : silent ? `since ${silent.clock}` : busy() ? `${c.step} of ${c.steps} steps · ${left(c)}` : rig);
-    document.title = `${{ bad: "⚠ ", on: "● " }[tone] ?? ""}${word}${busy() && !silent && !S.out ? ` ${c.step}/${c.steps}` : ""} · ${rig || "hairstage"}`;
+    setContent(detail, S.loggedOut ? "" : silent ? `since ${silent.clock}` : busy() ? `${c.step} of ${c.steps} steps · ${timeLeft(c)}` : rig);
+    document.title = `${{ bad: "⚠ ", on: "● " }[tone] ?? ""}${word}${busy() && !silent && !S.loggedOut ? ` ${c.step}/${c.steps}` : ""} · ${rig || "hairstage"}`;
     for (const link of links) {
-      const here = link.hash === `#${shown?.name}`;
-      if (here) link.setAttribute("aria-current", "page");
-      else link.removeAttribute("aria-current");
+      link.ariaCurrent = link.hash === `#${shown?.name}` ? "page" : null;
     }
-    views.hidden = who.hidden = S.out;
+    views.hidden = who.hidden = S.loggedOut;
     const other = S.lease.holder !== null && !mine();
-    say(steering, S.lease.holder === null ? "no lease" : mine() ? "you steer" : `${S.lease.holder} steers`);
-    steering.title = S.lease.holder === null ? "anybody may start a capture" : `until ${clock(S.lease.expires)}`;
-    say(held, mine() ? "release" : "take");
+    setContent(steering, S.lease.holder === null ? "no lease" : mine() ? "you steer" : `${S.lease.holder} steers`);
+    steering.title = S.lease.holder === null ? "any operator may start a capture" : `until ${clock(S.lease.expires)}`;
+    setContent(held, mine() ? "release" : "take");
     held.hidden = other || !(S.who?.scopes.includes("steer"));
-    stop.disabled = S.out || !busy() || c.state === "aborting" || c.state === "finishing";
+    stop.disabled = S.loggedOut || !busy() || c.state === "aborting" || c.state === "finishing";
     const waiting = pressed?.going ? Math.floor((Date.now() - pressed.at) / 1000) : 0;
-    say(label, !pressed?.going ? "Blackout" : waiting < 2 ? "going dark …" : `no response: ${waiting} s`);
+    setContent(label, !pressed?.going ? "Blackout" : waiting < 2 ? "going dark …" : `no response: ${waiting} s`);
     dark.classList.toggle("going", Boolean(pressed?.going));
   };
 }
@@ -110,23 +108,23 @@ function show() {
   changed();
 }
 
-/** Each change of the last press of Blackout. */
+/** The state of the last Blackout press has changed. */
 function onPressed() {
   changed();
-  const answer = pressed?.answer;
-  if (!answer && !pressed?.going) tell("yielded"); // refused, or dismissed
-  if (!answer || S.out) return;
-  const took = seconds((answer.at - pressed.at) / 1000);
-  const doubted = contradicts(answer.detail) || contradicts(S.capture?.error);
-  if (!answer.safe) notice("Blackout: unknown, unsafe. Treat every lamp as lit.", "bad");
+  const response = pressed?.response;
+  if (!response && !pressed?.going) emit("yielded"); // refused, or dismissed
+  if (!response || S.loggedOut) return;
+  const took = seconds((response.at - pressed.at) / 1000);
+  const doubted = contradicts(response.detail) || contradicts(S.capture?.error);
+  if (!response.safe) notice("Blackout: unknown, unsafe. Treat every lamp as lit.", "bad");
   else notice(`${doubted ? "Reported dark" : "Dark, verified"}, after ${took}.`, "good");
-  // What it has ended is read before pictures take the connections again: events may be refused to this page.
-  load.now().catch(() => {}).then(() => tell("yielded"));
+  // Read the new state before images take the connections again: this page may have no event stream.
+  load.now().catch(() => {}).then(() => emit("yielded"));
 }
 
-function onOver() {
-  if (S.out) return;
-  S.out = true;
+function onLoggedOut() {
+  if (S.loggedOut) return;
+  S.loggedOut = true;
   removeEventListener("hashchange", show);
   shown?.end?.();
   shown = null;
@@ -139,23 +137,23 @@ async function start() {
     await begin();
   } catch (error) {
     if (error.status === 401) return;
-    say(view, h("p.bad", `The service does not respond (${error.message}). The page tries again.`));
+    setContent(view, h("p.bad", `The service does not respond (${error.message}). The page tries again.`));
     setTimeout(start, 2000);
     return;
   }
   resend();
   onChange(() => {
-    if (S.rig && !shown && !S.out) {
+    if (S.rig && !shown && !S.loggedOut) {
       addEventListener("hashchange", show);
       show();
     } else if (S.rig) shown?.update?.();
-    else if (S.problem && !S.out) say(view, h("p.bad", `The service refuses data that this page needs: ${S.problem}. The page tries again.`));
+    else if (S.problem && !S.loggedOut) setContent(view, h("p.bad", `The service refused a request: ${S.problem}. The page tries again.`));
   });
   changed();
 }
 
 for (const part of [bar(), alarmBox(document.getElementById("alarms"))]) onChange(part);
-service.addEventListener("over", onOver);
+service.addEventListener("logged out", onLoggedOut);
 service.addEventListener("pressed", onPressed);
 document.addEventListener("visibilitychange", () => changed());
 changed();

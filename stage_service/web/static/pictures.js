@@ -1,13 +1,13 @@
 // A frame of each camera side by side, with exposure and overlays.
 
-import { get, service } from "./ask.js";
+import { get, service } from "./api.js";
 import { pressed } from "./blackout.js";
-import { h, number, percent, say, svg } from "./dom.js";
+import { h, number, percent, setContent, svg } from "./dom.js";
 import { S } from "./state.js";
 
-/** Cells in `grid`, one a camera. `show(path, more)` shows the frame `path(camera)`; `query` is how it is
- * exposed, `words` what it is, `lacks` the cameras without, `figures` whether they are asked for, `over`
- * what is drawn on top: `over(camera)`, SVG in pixels. A slow frame is left out for the newest. */
+/** Cells in `grid`, one per camera. `show(path, more)` shows the frame `path(camera)`. `more.query`: exposure options;
+ * `words`: its label; `lacks`: cameras without a frame; `figures`: request histogram and focus; `over(camera)`: SVG
+ * overlay in pixels. While a frame loads, only the newest request is kept. */
 export function pictures(grid, signal) {
   const cells = new Map();
   service.addEventListener("yield", () => { for (const cell of cells.values()) cell.drop(); }, { signal });
@@ -27,7 +27,7 @@ export function pictures(grid, signal) {
     cells.set(name, cell);
     return cell;
 
-    /** End the download under way, until "yielded". */
+    /** Abort the download until "yielded". */
     function drop() {
       if (!cell.busy) return;
       cell.dropped = true;
@@ -46,32 +46,32 @@ export function pictures(grid, signal) {
       }
       if (more.lacks?.includes(name)) {
         image.removeAttribute("src");
-        cell.busy = false; // of what was on its way nothing more is heard
+        cell.busy = false; // removing `src` aborts the download without an event
         drawn.replaceChildren();
         plot.remove();
-        say(text, `${name}: no frame`);
+        setContent(text, `${name}: no frame`);
         return;
       }
-      if (cell.busy) return; // the newest that was asked for comes next
+      if (cell.busy) return; // `done` loads the newest request
       cell.busy = true;
       const done = () => { cell.busy = false; if (cell.next !== next) cell.show(() => cell.next.path, cell.next.more); };
       image.onload = done;
-      image.onerror = () => { say(text, `${name}: no frame`); done(); };
+      image.onerror = () => { setContent(text, `${name}: no frame`); done(); };
       image.alt = `${name}, ${more.words}`;
       image.src = `${next.path}.png?${[`size=${Math.min(Math.max(width, height), 480)}`, ...more.query].join("&")}`;
-      say(text, name);
+      setContent(text, name);
       drawn.replaceChildren(...(more.over?.(name) ?? []));
-      if (more.figures) tell(next);
+      if (more.figures) showFigures(next);
       else plot.remove();
     }
 
-    async function tell(next) {
+    async function showFigures(next) {
       const f = await get(`${next.path}.json`, { signal, yields: true }).catch(() => null);
       if (!f || cell.next !== next) return;
       const top = Math.log1p(Math.max(...f.histogram));
       plot.replaceChildren(...f.histogram.map((n, i) => svg("path", { class: i === 63 && f.saturated ? "full" : "", d: `M${i} 20V${(20 - (19 * Math.log1p(n)) / (top || 1)).toFixed(2)}h.9V20z` })));
       if (!plot.parentNode) figure.append(plot);
-      say(text, `${name} · saturated ${percent(f.saturated)} · focus ${number(f.focus)} · 99.5 % at ${number(f.white)}`);
+      setContent(text, `${name} · saturated ${percent(f.saturated)} · focus ${number(f.focus)} · 99.5 % at ${number(f.white)}`);
     }
   }
 

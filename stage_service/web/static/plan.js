@@ -1,8 +1,8 @@
-// A plan with its cost, started or queued.
+// A capture plan and its cost; start it or queue it.
 
 import { attempt, notice, steering, underLease } from "./acts.js";
-import { ask, get } from "./ask.js";
-import { bytes, h, number, say, seconds, words } from "./dom.js";
+import { get, request } from "./api.js";
+import { bytes, definitions, h, number, seconds, setContent, words } from "./dom.js";
 import { dome } from "./dome.js";
 import { formOf } from "./form.js";
 import { S, busy, load } from "./state.js";
@@ -16,7 +16,7 @@ const PRESETS = {
   "slow, for eyes": () => ({ rate_hz: 2.5 }),
 };
 const TYPING_MS = 120;
-let kept = null; // what was typed, for whoever comes back to this view
+let kept = null; // the input, kept when another view is opened
 
 export function open(view) {
   const side = h("aside.cost", { "aria-live": "polite" }, h("p.quiet", "…"));
@@ -24,9 +24,9 @@ export function open(view) {
   view.append(h(".split", main, side));
   let form = null;
   let cost = null;
-  let asked = 0;
+  let latest = 0;
   let timer = 0;
-  const picker = dome(S.rig, { label: "lights to shoot: click to choose", onpick: pick });
+  const picker = dome(S.rig, { label: "lights to capture: click to select", onpick: pick });
   const then = thenFields();
   const start = steering("Start now", begin, { kind: "go", lights: true, ready: () => cost !== null && !busy() });
   const queue = steering("Put into the queue", enqueue, { ready: () => cost !== null });
@@ -34,7 +34,7 @@ export function open(view) {
   get("/openapi.json").then((api) => {
     const schemas = api.components.schemas;
     const d = S.rig.defaults;
-    const hints = { tracking_every: `${d.tracking_every} (rig file)`, retries: `${d.retries} (rig file)`, rate_hz: "as fast as it goes", "rows.last": "the last", lights: "all, or names", projectors: "all, none, or names", consent: "who agreed, and to what" };
+    const hints = { tracking_every: `${d.tracking_every} (rig file)`, retries: `${d.retries} (rig file)`, rate_hz: "as fast as possible", "rows.last": "the last", lights: "all, or names", projectors: "all, none, or names", consent: "who agreed, and to what" };
     for (const group of ["exposure", "level"]) for (const [kind, value] of Object.entries(d[group])) hints[`${group}.${kind}`] = `${value} (rig file)`;
     form = formOf(schemas.CapturePlan, schemas, { hints, onchange: typed });
     if (kept) form.fill(kept);
@@ -42,12 +42,12 @@ export function open(view) {
       h("h1", "Plan a capture"),
       h(".presets", { role: "group", "aria-label": "presets" }, Object.entries(PRESETS).map(([name, make]) => h("button", { type: "button", onclick: () => { form.fill(make()); typed(); } }, name))),
       form.element,
-      h("fieldset", h("legend", "lights"), h("p.quiet", "Click lights to choose them. Without a choice all are shot."), h(".picker", picker.element)),
+      h("fieldset", h("legend", "lights"), h("p.quiet", "Click lights to select them. If none is selected, the capture uses all."), h(".picker", picker.element)),
       then.element,
       h("details", h("summary", "fields of a plan"), h("p.quiet", schemas.CapturePlan.description)),
     );
     typed();
-  }).catch((error) => say(main, h("p.bad", error.message)));
+  }).catch((error) => setContent(main, h("p.bad", error.message)));
 
   function pick(name) {
     const lights = form?.get("lights");
@@ -64,17 +64,17 @@ export function open(view) {
   }
 
   async function validate() {
-    const mine = ++asked;
+    const run = ++latest;
     try {
-      const found = await ask("POST /plans:validate", kept);
-      if (mine !== asked) return;
+      const found = await request("POST /plans:validate", kept);
+      if (run !== latest) return;
       cost = found;
-      say(side, ...costOf(found));
+      setContent(side, ...costOf(found));
     } catch (error) {
-      if (mine !== asked) return;
+      if (run !== latest) return;
       cost = null;
       const problems = error.data?.problems ?? error.data?.errors?.map((e) => `${e.loc}: ${e.msg}`) ?? [error.message];
-      say(side, h("h2", "This plan cannot be shot"), h("ul.problems", problems.map((text) => h("li", text))));
+      setContent(side, h("h2", "This plan cannot be captured"), h("ul.problems", problems.map((text) => h("li", text))));
     }
     side.append(arming, h(".line", start.element, queue.element), h("p.quiet", "Starting takes the lease: until you release it, others may abort and send Blackout, but not steer."));
     update();
@@ -90,12 +90,12 @@ export function open(view) {
     const free = S.health?.disk_free_bytes;
     return [
       h("h2", "Cost"),
-      h("dl.facts", Object.entries({
+      h("dl.facts", definitions({
         "Time": seconds(c.seconds), "Frames": number(c.frames),
         "Steps": number(c.steps), "Disk": h(free !== null && c.bytes > free ? "b.bad" : "span", `${bytes(c.bytes)}${free ? ` of ${bytes(free)}` : ""}`),
         "Dose at the head, J/m²": c.dose.map((x) => number(x)).join(" · "), "Lamp seconds": number(c.lamp_seconds),
         "Flashes": h(f.needs_consent ? "b.warn" : "span", `${f.hz ? `${number(f.hz)} Hz, ` : ""}${f.band}`), "Limited by": c.limited_by,
-      }).map(([name, value]) => h("div", h("dt", name), h("dd", value)))),
+      })),
       h(".bars", causes.map(([name, s]) => [h("span", words(name)), h("progress", { max: most, value: s, "aria-label": name }), h("span.n", seconds(s))])),
       f.needs_consent ? h("p.note", "Flashes of 3 to 30 Hz before a living subject: record the consent in the plan and name the person at the stage responsible for it, or choose the preset “slow, for eyes”.") : null,
       h("p.quiet", c.stepping_why),
@@ -107,13 +107,13 @@ export function open(view) {
 
   async function begin() {
     await underLease();
-    const made = await ask("POST /captures", { ...wanted(), ...(cost.flash.needs_consent && armed.value ? { armed_by: armed.value } : {}) });
+    const made = await request("POST /captures", { ...wanted(), ...(cost.flash.needs_consent && armed.value ? { armed_by: armed.value } : {}) });
     await load.capture(made.id);
     location.hash = "#now";
   }
 
   async function enqueue() {
-    await ask("POST /queue", wanted());
+    await request("POST /queue", wanted());
     notice("The capture is in the queue.");
   }
 
@@ -125,7 +125,7 @@ export function open(view) {
   return { update, end: () => clearTimeout(timer) };
 }
 
-/** The subject, and what is to be made of the capture. */
+/** The subject, and the pipeline to run after the capture. */
 function thenFields() {
   const uploads = h("select", { name: "upload" }, h("option", { value: "" }, "–"));
   const head = h("input", { name: "head", placeholder: "/path/on/the/service/head.obj", spellcheck: false });

@@ -1,21 +1,21 @@
-// The state of the service, requested once and updated by events.
+// The state of the service: requested at the start, updated by events.
 
-import { ask, captureAt, get, own, service } from "./ask.js";
+import { captureAt, get, own, request, service } from "./api.js";
 import { keepRight, pressed } from "./blackout.js";
 import { clock, local } from "./dom.js";
 import { follow } from "./stream.js";
 
 export const S = {
-  out: false, // nobody is logged in: nothing is known, and nothing is requested
-  connected: null, // null: not yet; false: events and answers have stopped
-  heardAt: null, // when the service last sent anything (ms)
-  polling: null, // why the service refuses events to this page, which then asks every second
-  problem: null, // why what the page needs first has not been answered
+  loggedOut: false, // no login: the page has no state and sends no requests
+  connected: null, // null: not yet; false: the connection is lost
+  contactAt: null, // when data last arrived from the service (ms)
+  polling: null, // why the service refuses the event stream; the page then polls every second
+  problem: null, // why the first requests failed
   who: null,
   rig: null,
   health: null,
-  capture: null, // the one that runs, else the last one
-  failed: null, // a capture that failed, until somebody has seen it
+  capture: null, // the running one, else the last one
+  failed: null, // a failed capture, until it is dismissed
   missing: [], // frames of this capture that were shot again or given up
   lease: { holder: null, expires: null },
   queue: { held: null, hold: null, waits_for: null, waiting: [] },
@@ -25,14 +25,13 @@ export const S = {
 
 const listeners = new Set();
 const SOON_MS = 30;
-const AGAIN_MS = 1000; // after a question that got no answer
-const CALM_MS = 250; // a capture tells its progress five times a second: drawing that is work, for nobody's eye
-let due = 0; // when it is drawn next; 0: nothing is to be
+const AGAIN_MS = 1000; // before a failed request is repeated
+const CALM_MS = 250; // progress events arrive five times a second; redraw less often
+let due = 0; // time of the next redraw; 0: none
 let drawn = 0;
 let timer = 0;
 
-/** `fn()` is called soon after a change; where only progress was made, four times a second. Returns what
- * ends that. */
+/** Call `fn()` soon after a change; after progress alone, four times a second. Returns a function that removes it. */
 export function onChange(fn) {
   listeners.add(fn);
   return () => listeners.delete(fn);
@@ -44,41 +43,46 @@ export function changed(calm = false) {
   if (due && due <= at) return;
   due = at;
   clearTimeout(timer);
-  // Not by requestAnimationFrame alone: a window that is covered must still show an alarm in its title.
+  // Not requestAnimationFrame: a covered window must show an alarm in its title.
   timer = setTimeout(() => {
     [due, drawn] = [0, performance.now()];
     for (const fn of listeners) fn();
   }, at - now);
 }
 
-export const events = new EventTarget(); // each of the service's, by its kind
+const events = new EventTarget(); // of the service, by kind
 
-const SILENT_S = 2.5; // a service sends something every 1 to 1.5 s
-const LONGEST_S = 1.5;
-
-service.addEventListener("word", () => { S.heardAt = Date.now(); });
-
-/** Since when nothing has come from the service: {since, clock, seconds}; null: it was heard just now. */
-export function silence() {
-  if (S.out || S.heardAt === null) return null;
-  const seconds = Math.max(0, (Date.now() - S.heardAt) / 1000);
-  if (S.connected !== false && seconds < SILENT_S) return null;
-  return { since: S.heardAt, clock: clock(S.heardAt), seconds: Math.floor(seconds) };
+/** Call `fn(event)` for these kinds of events. Returns a function that removes it. */
+export function onEvents(kinds, fn) {
+  for (const kind of kinds) events.addEventListener(kind, fn);
+  return () => kinds.forEach((kind) => events.removeEventListener(kind, fn));
 }
 
-/** Seconds after the service's last heartbeat at which the light bank puts its lamps off by itself, as this page
- * last read it; null: it has no watchdog; undefined: this browser has never read it. */
-export function watchdogSeconds() {
+const SILENT_S = 2.5; // the service sends data every 1 to 1.5 s
+const LONGEST_S = 1.5;
+
+service.addEventListener("contact", () => { S.contactAt = Date.now(); });
+
+/** How long no data has arrived: {since, clock, seconds}; null: the connection is alive. */
+export function silence() {
+  if (S.loggedOut || S.contactAt === null) return null;
+  const seconds = Math.max(0, (Date.now() - S.contactAt) / 1000);
+  if (S.connected !== false && seconds < SILENT_S) return null;
+  return { since: S.contactAt, clock: clock(S.contactAt), seconds: Math.floor(seconds) };
+}
+
+/** Timeout of the light bank's watchdog, as this browser last read it; null: no watchdog; undefined: never read. */
+function watchdogSeconds() {
   const kept = localStorage.getItem("watchdog_s");
   return S.rig?.watchdog_s !== undefined ? S.rig.watchdog_s : kept === null ? undefined : JSON.parse(kept);
 }
 
-/** What a light bank's watchdog does about a service that has stopped, with its seconds. */
+/** The effect of the light bank's watchdog if the service has stopped. */
 export function watchdogSentence(silent = null) {
   const s = watchdogSeconds();
-  if (s === undefined) return "If the service has stopped, the light bank's watchdog puts the lamps off, where the bank has one.";
+  if (s === undefined) return "If the service has stopped, the light bank's watchdog switches the lamps off, provided that the bank has one.";
   if (s === null) return "This light bank has no watchdog: lamps that are lit stay lit.";
-  const rule = `the light bank's watchdog puts the lamps off ${s} s after the service's last heartbeat`;
+  const rule = `the light bank's watchdog switches the lamps off ${s} s after the service's last heartbeat`;
   if (!silent) return `If the service has stopped, ${rule}.`;
   return `If the service has stopped, ${rule}: by ${clock(silent.since + 1000 * (s + LONGEST_S))}.`;
 }
@@ -97,7 +101,7 @@ export function refused() {
 }
 
 const under = new Map();
-/** One question of a kind at a time, and another after it where it was asked for meanwhile. */
+/** One request of a kind at a time; a call during it causes one more. */
 async function fresh(name, path, take) {
   const before = under.get(name);
   if (before) { before.again = true; return before.promise; }
@@ -107,7 +111,7 @@ async function fresh(name, path, take) {
       do {
         entry.again = false;
         const found = await get(path);
-        if (entry.again) continue; // something has happened since it was asked for
+        if (entry.again) continue; // outdated by an event
         take(found);
         changed();
       } while (entry.again);
@@ -119,7 +123,7 @@ async function fresh(name, path, take) {
   return entry.promise;
 }
 
-const SNAPSHOT = "snapshot"; // it is no capture but while it is taken
+const SNAPSHOT = "snapshot"; // listed as a capture only while it is exposed
 
 export const load = {
   rig: () => fresh("rig", "/rig", (x) => {
@@ -135,7 +139,7 @@ export const load = {
   jobs: () => fresh("jobs", "/jobs?limit=100", (x) => { S.jobs = x; S.jobsProblem = null; })
     .catch((error) => { S.jobsProblem = error.message; changed(); }),
   capture: (id) => fresh(`capture ${id}`, captureAt(id), takeCapture),
-  /** The capture that runs, which need not be the newest, else that. */
+  /** The running capture, which need not be the newest; else the newest. */
   now: async () => {
     await load.health();
     const going = S.health.capture;
@@ -144,10 +148,13 @@ export const load = {
   },
 };
 
+/** Load parts of the state; the next event repeats a failed request. */
+const reload = (...parts) => parts.forEach((part) => load[part]().catch(() => {}));
+
 function takeCapture(found) {
   const status = found.error ? { ...found, error: local(found.error) } : found;
   if (status.id === SNAPSHOT && status.state === "done") {
-    if (S.capture?.id === SNAPSHOT) load.now().catch(() => {});
+    if (S.capture?.id === SNAPSHOT) reload("now");
     return;
   }
   if (S.capture?.id !== status.id) {
@@ -165,18 +172,18 @@ function takeNewest([newest]) {
   if (newest) takeCapture(newest);
 }
 
-/** The capture that is shown is there no more. */
+/** The displayed capture was removed. */
 function gone() {
   S.capture = S.failed = null;
   S.missing = [];
 }
 
-/** What the capture lacked is shot now. */
+/** A resumed capture repeats its missing frames. */
 function resumed(state) {
   if (S.capture.state === "done" && state !== "done") S.missing = [];
 }
 
-function heard(kind, data) {
+function onEvent(kind, data) {
   const [about] = kind.split(".");
   if (kind === "capture.progress") {
     const { id, ...progress } = data;
@@ -190,29 +197,26 @@ function heard(kind, data) {
     }
     if (data.state === "done" && data.outcome === "failed") S.failed = { id: data.id, error: data.error };
     load.capture(data.id).catch(() => {});
-    load.health().catch(() => {});
-    load.queue().catch(() => {});
-  } else if (kind === "capture.over") { // from now on another may begin
+    reload("health", "queue");
+  } else if (kind === "capture.over") { // the next one may start
     load.capture(data.id).catch(() => {});
-    load.health().catch(() => {});
-    load.queue().catch(() => {});
+    reload("health", "queue");
   } else if (kind === "capture.removed") {
     if (S.failed?.id === data.id) S.failed = null;
     if (S.capture?.id === data.id) {
       gone();
-      load.now().catch(() => {});
+      reload("now");
     }
   } else if (kind === "capture.restored" || kind === "captures.read") {
-    if (S.failed === null) load.now().catch(() => {}); // else what failed stays until it is seen
+    if (S.failed === null) reload("now"); // else the failed one stays until it is dismissed
   } else if (kind === "capture.frame_missing") {
     S.missing = [{ ...data, at: new Date().toISOString() }, ...S.missing].slice(0, 200);
   } else if (kind === "stage.lease") {
     S.lease = data;
   } else if (about === "stage") {
-    load.health().catch(() => {});
-    load.queue().catch(() => {});
+    reload("health", "queue");
   } else if (about === "queue") {
-    load.queue().catch(() => {});
+    reload("queue");
   } else if (kind === "job.progress") {
     const { job, ...progress } = data;
     const known = S.jobs?.find((x) => x.id === job);
@@ -222,16 +226,16 @@ function heard(kind, data) {
   if (kind !== "capture.step") changed(kind === "capture.progress" || kind === "job.progress");
 }
 
-let line = 0; // which of the lines to the service is the one that holds, or was lost last
+let line = 0; // number of the current connection, or of the one lost last
 const down = () => { line++; S.connected = false; changed(); };
 
-/** Ask for everything: at the start, and whenever the line was lost. */
+/** Request the whole state: at the start and after each reconnection. */
 async function all(mine) {
   const version = S.health?.version;
   await Promise.all([load.rig(), load.lease(), load.queue(), load.now(), load.jobs()]);
-  if (version && S.health.version !== version) location.reload(); // another console came with it
+  if (version && S.health.version !== version) location.reload(); // the service was updated: load its console
   if (S.capture?.state === "done" && S.capture.outcome === "failed" && S.failed === null
-      && sessionStorage.getItem("seen") !== S.capture.id) S.failed = { id: S.capture.id, error: S.capture.error };
+      && sessionStorage.getItem("dismissed") !== S.capture.id) S.failed = { id: S.capture.id, error: S.capture.error };
   await keepLease();
   if (mine !== line) return;
   S.connected = true;
@@ -240,7 +244,7 @@ async function all(mine) {
   events.dispatchEvent(new Event("fresh"));
 }
 
-/** Where the service refuses events, `why`: ask for what they would have told. */
+/** The service refuses the event stream (`why`): poll the state. */
 async function poll(why) {
   const mine = ++line;
   const shown = () => JSON.stringify([S.connected, S.capture?.id, S.capture?.state, S.capture?.outcome]);
@@ -258,7 +262,7 @@ async function poll(why) {
   if (shown() !== before) events.dispatchEvent(new Event("fresh"));
 }
 
-/** Ask until all is answered: one lost question does not end the line, which would have it asked again. */
+/** Request the state until it is complete; a failed request does not close the connection. */
 async function up() {
   const mine = ++line;
   while (mine === line) {
@@ -274,28 +278,28 @@ async function up() {
   return undefined;
 }
 
-/** Begin; raises where nobody is logged in. */
+/** Start; raises without a login. */
 export async function begin() {
   S.who = await get("/login");
   keepRight(S.who);
-  follow({ event: heard, up, down, refused: poll });
-  setInterval(() => { if (S.connected && !S.out && !document.hidden) load.health().catch(() => {}); }, 30_000); // the disk
+  follow({ event: onEvent, up, down, refused: poll });
+  setInterval(() => { if (S.connected && !S.loggedOut && !document.hidden) reload("health"); }, 30_000); // for the free disk space
 }
 
 let aged = false;
-setInterval(() => { // what is drawn from the time since something happened
+setInterval(() => { // texts that show elapsed time
   const ages = silence() !== null || Boolean(pressed?.going);
   if (ages || aged) changed();
   aged = ages;
 }, CALM_MS);
 
-// The lease, for as long as a page holds it.
+// The lease is renewed while this page holds it.
 const LEASE_S = 150;
 
 export async function takeLease(holder) {
   if (mine()) return;
   own.lease = null;
-  own.lease = await ask("POST /lease", { holder, seconds: LEASE_S });
+  own.lease = await request("POST /lease", { holder, seconds: LEASE_S });
   S.lease = { holder: own.lease.holder, expires: own.lease.expires };
   changed();
 }
@@ -303,7 +307,7 @@ export async function takeLease(holder) {
 export async function releaseLease() {
   if (!own.lease) return;
   try {
-    await ask("DELETE /lease");
+    await request("DELETE /lease");
   } finally {
     own.lease = null;
     await load.lease();
@@ -313,7 +317,7 @@ export async function releaseLease() {
 async function keepLease() {
   if (!own.lease) return;
   try {
-    own.lease = await ask("PATCH /lease", { seconds: LEASE_S });
+    own.lease = await request("PATCH /lease", { seconds: LEASE_S });
     S.lease = { holder: own.lease.holder, expires: own.lease.expires };
   } catch (error) {
     if (error.kind === "no-lease") own.lease = null;
@@ -322,7 +326,7 @@ async function keepLease() {
   changed();
 }
 
-setInterval(() => { if (own.lease && S.connected && !S.out) keepLease(); }, 50_000);
-setInterval(() => { // no event says that one has run out
-  if (!S.out && S.lease.expires && new Date(S.lease.expires) < new Date()) load.lease().catch(() => {});
+setInterval(() => { if (own.lease && S.connected && !S.loggedOut) keepLease(); }, 50_000);
+setInterval(() => { // no event reports its end
+  if (!S.loggedOut && S.lease.expires && new Date(S.lease.expires) < new Date()) reload("lease");
 }, 5_000);

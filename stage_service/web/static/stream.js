@@ -1,47 +1,47 @@
 // The service's event stream, reconnected after failures and restarts.
 //
-// `fetch` instead of `EventSource`: it has the status of a refusal, and the comments that the service sends
-// every second, so that a line that is dead without having ended is noticed.
+// `fetch`, not `EventSource`: it gives the status of a refusal, and the comments that the service sends every second,
+// by which a dead connection is detected.
 
-import { service, tell } from "./ask.js";
+import { emit, service } from "./api.js";
 
 const SILENCE_MS = 8000;
 const PAUSES_MS = [500, 1000, 2000, 4000];
 const REFUSED_MS = 1000;
 
-/** Follow the events: `on.event(kind, data)`, `on.up()` when a line is new, `on.down()` when it is lost,
- * `await on.refused(why)` every second while the service refuses one. */
+/** Follow the events: `on.event(kind, data)`, `on.up()` after each connection, `on.down()` when it is lost,
+ * `await on.refused(why)` every second while the service refuses it. */
 export function follow(on) {
-  let stop = null; // ends the line; not null while there is one, or one is tried
+  let stop = null; // aborts the connection or its attempt; null: none
   let tries = 0;
   let waiting = 0;
 
   async function line(abort) {
     let silence = setTimeout(() => abort.abort(), SILENCE_MS);
-    const heard = () => {
+    const onContact = () => {
       clearTimeout(silence);
       silence = setTimeout(() => abort.abort(), SILENCE_MS);
-      tell("word");
+      emit("contact");
     };
     try {
-      const answer = await fetch("/events", { signal: abort.signal, cache: "no-store", credentials: "same-origin" });
-      if (answer.status === 401) {
-        tell("over");
+      const response = await fetch("/events", { signal: abort.signal, cache: "no-store", credentials: "same-origin" });
+      if (response.status === 401) {
+        emit("logged out");
         return { over: true };
       }
-      if (!answer.ok) {
-        const { detail } = await answer.json().catch(() => ({}));
-        return { refused: detail ?? `HTTP ${answer.status}` };
+      if (!response.ok) {
+        const { detail } = await response.json().catch(() => ({}));
+        return { refused: detail ?? `HTTP ${response.status}` };
       }
       tries = 0;
-      heard();
+      onContact();
       on.up();
-      const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
       let rest = "";
       for (;;) {
         const { value, done } = await reader.read();
         if (done) return {};
-        heard();
+        onContact();
         const blocks = (rest + value.replaceAll("\r\n", "\n")).split("\n\n");
         rest = blocks.pop();
         for (const block of blocks) read(block);
@@ -72,7 +72,7 @@ export function follow(on) {
     waiting = setTimeout(go, ended.refused ? REFUSED_MS : PAUSES_MS[Math.min(tries++, PAUSES_MS.length - 1)]);
   }
 
-  // A browser keeps few connections to one host: a page that nobody sees gives its own back.
+  // A browser opens few connections to a host: a hidden page closes its own.
   document.addEventListener("visibilitychange", () => {
     if (document.hidden) stop?.abort();
     else {

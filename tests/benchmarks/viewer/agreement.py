@@ -120,8 +120,8 @@ def _traced(
 
     def twice(render: Callable[[int, int, int], Floats]) -> tuple[Array, Array]:
         """Direct light and all light, two pictures of each `(2, ..., H, W, 3)`."""
-        spent = (1, DIRECT * effort.spp), (DEPTH, effort.spp)
-        both = [np.array([render(depth, spp, seed) for seed in (1, 2)]) for depth, spp in spent]
+        efforts = (1, DIRECT * effort.spp), (DEPTH, effort.spp)
+        both = [np.array([render(depth, spp, seed) for seed in (1, 2)]) for depth, spp in efforts]
         return both[0], both[1]
 
     def single(depth: int, spp: int, seed: int) -> Floats:

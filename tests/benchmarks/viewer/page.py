@@ -36,11 +36,11 @@ class Shown:
 
     def camera(self, size: int) -> Camera:
         """The page's view as a picture of `size` pixels a side."""
-        told = self.page.evaluate(
+        values = self.page.evaluate(
             f"(() => {{ const {{ K, R, t }} = viewer.orbit.pinhole({size}, {size});"
             "return { K, R, t }; })()"
         )
-        K, R, t = (np.array(told[k]) for k in "KRt")
+        K, R, t = (np.array(values[k]) for k in "KRt")
         return Camera("orbit", size, size, K, R, t)
 
     def light(self, weights: Mapping[int, Any] | str) -> None:
@@ -51,8 +51,8 @@ class Shown:
         """The picture at rest `(size, size, 3)`, radiance: means of `over` x `over` pixels, each of
         at least so many `samples` and of all turns of its lights. `ambient` as the page's slider
         sets it."""
-        told = self.page.evaluate(AT_REST, [size * over, samples, ambient])
-        blocks = np.array(told, np.float32).reshape(size, over, size, over, 4)
+        values = self.page.evaluate(AT_REST, [size * over, samples, ambient])
+        blocks = np.array(values, np.float32).reshape(size, over, size, over, 4)
         return np.asarray(blocks.mean((1, 3))[::-1, :, :3])
 
 

@@ -31,15 +31,15 @@ def measure(shown: Shown, seconds: float) -> dict[str, Any]:
         page.evaluate(TURN, [mode, paced, 0.5])  # the first frames compile
         page.context.browser.start_tracing(page=page, categories=CATEGORIES)
         before = browser_cpu_s()
-        told = page.evaluate(TURN, [mode, paced, seconds])
-        spent = browser_cpu_s() - before
+        measured = page.evaluate(TURN, [mode, paced, seconds])
+        browser_s = browser_cpu_s() - before
         events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
         drawn = sum(e["name"] == FRAME for e in events)
         found[name] = {
-            "frames_a_second": drawn / told["seconds"],
-            "pictures_a_second": told["frames"] / told["seconds"],
-            "cpu_s_each": spent / max(told["frames"], 1),
-            "strands_share": told["quality"],
+            "frames_a_second": drawn / measured["seconds"],
+            "pictures_a_second": measured["frames"] / measured["seconds"],
+            "cpu_s_each": browser_s / max(measured["frames"], 1),
+            "strands_share": measured["quality"],
         }
     found["shader_over_line"] = found["lit"]["cpu_s_each"] / found["line"]["cpu_s_each"]
     return found
@@ -61,7 +61,7 @@ TURN = """([mode, paced, seconds]) => new Promise((done) => {
         if (picture.ready()) {
             if (spent > seconds && frames > 1)
                 return done({ frames, seconds: spent, quality: picture.state.quality });
-            if (paced && frames) viewer.pace(picture.took);
+            if (paced && frames) viewer.adaptQuality(picture.took);
             orbit.turn(2, 0);
             picture.moving(viewer.view);
             frames++;

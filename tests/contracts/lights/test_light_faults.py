@@ -19,7 +19,7 @@ TCP, RTU, DMX = "simulated TCP", "simulated RTU", "simulated DMX"
 LATE_S = 0.3  # the drivers' deadline is 0.2 s
 SELECT, STATUS, OFF = "6 1000", "4 0", "6 1003"
 
-TOLD = {
+MESSAGES = {
     "silent": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
     "late": (DeviceTimeout, "expected a reply within {timeout} s, received nothing"),
     "garbage": (DeviceTimeout, "within {timeout} s, received no reply in 10 bytes: 00 ff 68 73"),
@@ -42,15 +42,15 @@ def goes_dark(one):
 
 
 def wires(*without_on_tcp):
-    return [(w, k) for k in TOLD for w in (TCP, RTU) if not (w == TCP and k in without_on_tcp)]
+    return [(w, k) for k in MESSAGES for w in (TCP, RTU) if not (w == TCP and k in without_on_tcp)]
 
 
 @pytest.mark.parametrize(("wire", "kind"), wires("crc"))
-def test_a_disturbed_command_is_told_and_what_follows_is_right(bench, wire, kind):
+def test_disturbed_command_is_reported_and_later_ones_succeed(bench, wire, kind):
     one = bench(wire, Fault("lights", kind, 1, request=SELECT, seconds=LATE_S))
     one.driver.off()
     one.pulses = 1
-    error, text = GARBAGE_ON_TCP if (wire, kind) == (TCP, "garbage") else TOLD[kind]
+    error, text = GARBAGE_ON_TCP if (wire, kind) == (TCP, "garbage") else MESSAGES[kind]
     timeout_s = one.driver.config.timeout_s
     text = text.format(timeout=f"{timeout_s:g}")
     began = time.monotonic()
@@ -72,7 +72,7 @@ def test_a_disturbed_command_is_told_and_what_follows_is_right(bench, wire, kind
 
 
 @pytest.mark.parametrize("kind", ["silent", "late", "garbage", "crc", "nak", "unplug"])
-def test_a_disturbed_reading_is_told_and_what_follows_is_right(bench, kind):
+def test_disturbed_reading_is_reported_and_later_ones_succeed(bench, kind):
     one = bench(RTU, Fault("lights", kind, 1, request=STATUS, seconds=LATE_S))
     one.pulses = 1
     with pytest.raises(DeviceError, match="reading the status"):
@@ -85,7 +85,7 @@ def test_a_disturbed_reading_is_told_and_what_follows_is_right(bench, kind):
     assert one.driver.status().lit == 0
 
 
-def test_bytes_before_an_rtu_answer_are_no_answer(bench):
+def test_bytes_before_an_rtu_reply_are_skipped(bench):
     one = bench(RTU, Fault("lights", "noise", 1, request=SELECT))
     one.pulses = 1
     with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .* received no reply in 18 bytes: 00 ff"):
@@ -113,7 +113,7 @@ def test_a_bank_that_is_always_late_is_never_believed(bench, wire):
 
 
 @pytest.mark.parametrize("wire", [TCP, RTU])
-def test_off_reaches_a_bank_whose_answers_are_lost(bench, wire):
+def test_off_reaches_a_bank_whose_replies_are_lost(bench, wire):
     one = bench(wire, *[Fault("lights", "silent", 1) for _ in range(9)])
     one.driver.all_on()
     one.pulses = 1
@@ -133,7 +133,7 @@ def test_a_mute_bank_is_noticed_in_time_and_its_watchdog_puts_the_lamps_off(benc
     one.pulses = 1
     for call in (one.driver.off, one.driver.status, one.driver.off):
         began = time.monotonic()
-        with pytest.raises(DeviceTimeout, match="its watchdog puts the lamps off"):
+        with pytest.raises(DeviceTimeout, match="its watchdog switches the lamps off"):
             call()
         assert time.monotonic() - began < 2 * one.driver.config.timeout_s
     assert len(one.lit()) == 200
@@ -154,7 +154,7 @@ def test_an_unplugged_bank_comes_back(bench, wire):
 
 
 @pytest.mark.parametrize("wire", [TCP, RTU])
-def test_a_lamp_that_cannot_be_put_off_is_seen(bench, wire):
+def test_a_lamp_stuck_on_is_detected(bench, wire):
     one = bench(wire)
     one.driver.select(5)
     one.lamps.stick()
@@ -174,7 +174,7 @@ def test_a_bank_that_lies_about_its_lamps_is_caught_when_they_are_put_on(bench, 
     assert one.lit() == []
 
 
-def test_the_cause_of_dark_lamps_is_told(bench):
+def test_the_cause_of_dark_lamps_is_reported(bench):
     one = bench(TCP)
     one.lamps.cut_by(lambda: (False, True))
     with pytest.raises(DeviceError, match=r"0 lit, the emergency stop is pressed. Clear the cause"):
@@ -217,7 +217,7 @@ def test_a_table_that_reads_back_otherwise_is_not_armed(bench):
 
 
 @pytest.mark.parametrize("kind", ["silent", "garbage", "late", "unplug"])
-def test_dmx_faults_are_told(bench, kind):
+def test_dmx_faults_are_reported(bench, kind):
     one = bench(DMX, Fault("lights", kind, 1, request="3", seconds=LATE_S))
     one.driver.select(5)
     one.pulses = 1
@@ -231,7 +231,7 @@ def test_dmx_faults_are_told(bench, kind):
 
 
 @pytest.mark.parametrize("widget", ["by Enttec", "that ignores what user data it is asked for"])
-def test_a_late_dmx_answer_is_not_taken_for_the_next_one_s(bench, widget, monkeypatch):
+def test_late_dmx_reply_is_not_matched_to_the_next_request(bench, widget, monkeypatch):
     execute = DmxWidget._execute
     if widget != "by Enttec":
         monkeypatch.setattr(
@@ -254,14 +254,14 @@ def test_a_late_dmx_answer_is_not_taken_for_the_next_one_s(bench, widget, monkey
     assert one.seen.count("3") == 46  # one of them when it connected
 
 
-def test_noise_before_a_widgets_answer_is_skipped(bench):
+def test_noise_before_a_widgets_reply_is_skipped(bench):
     one = bench(DMX, Fault("lights", "noise", 1, request="3"))
     one.pulses = 1
     one.driver.select(6)
     assert one.lit() == [6]
 
 
-def test_dmx_lamps_stay_lit_when_nobody_speaks_as_its_capabilities_say(bench):
+def test_dmx_lamps_stay_lit_without_a_heartbeat_as_capabilities_state(bench):
     now = [50.0]
     one = bench(DMX, Fault("lights", "hang", 1), clock=lambda: now[0])
     one.driver.select(5)

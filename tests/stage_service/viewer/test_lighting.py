@@ -45,12 +45,12 @@ def test_a_sum_of_frames_is_exact_to_8_bits(model):
     assert 20 < found.mean() < 235
 
 
-def shot(folder, answers, lights, without=()):
+def shot(folder, reflectance, lights, without=()):
     """A capture of the camera "c" whose frames are `answers (L, H, W, 3)`, some of them missing."""
     camera = Camera.look_at("c", 32, 24, (0, -1, 0), (0, 0, 0), 20.0)
     steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(lights)]
     writer = CaptureWriter.create(folder, Rig("r", (camera,), lights), {"steps": steps})
-    for step, radiance in zip(steps, answers, strict=True):
+    for step, radiance in zip(steps, reflectance, strict=True):
         if step.light not in without:
             writer.write_frame(step, "c", radiance.astype(np.float32))
     writer.finish("completed", {})
@@ -60,13 +60,13 @@ def shot(folder, answers, lights, without=()):
 @pytest.mark.parametrize("scale", [1e-4, 1e3])
 def test_without_a_fit_frames_are_neither_black_nor_white(model, tmp_path, scale):
     """Whatever the unit of an import: the 99th percentile of all frames is about white."""
-    answers = scale * np.random.default_rng(6).gamma(0.5, 1, (12, 24, 32, 3))
+    reflectance = scale * np.random.default_rng(6).gamma(0.5, 1, (12, 24, 32, 3))
     lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(dome_positions(12, 1.3)))
-    lighting = Viewed(model, shot(tmp_path / "capture", answers, lights)).lighting
-    told = lighting.about()
-    white = told["exposure"] * np.percentile(answers, 99)
+    lighting = Viewed(model, shot(tmp_path / "capture", reflectance, lights)).lighting
+    description = lighting.about()
+    white = description["exposure"] * np.percentile(reflectance, 99)
     assert white == pytest.approx(1, rel=0.1)
-    png = lighting.sum("c", {3: [1, 1, 1]}, told["exposure"])
+    png = lighting.sum("c", {3: [1, 1, 1]}, description["exposure"])
     found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     assert 40 < found.mean() < 200
     assert Viewed(model).lighting.about()["exposure"] == 1
@@ -74,16 +74,18 @@ def test_without_a_fit_frames_are_neither_black_nor_white(model, tmp_path, scale
 
 def test_a_missing_frame_is_stood_for_by_that_of_the_nearest_light(model, tmp_path):
     """Light from there comes from beside it, as much of it; a map can still be shown."""
-    answers = np.random.default_rng(7).gamma(0.5, 0.02, (3, 24, 32, 3))
+    reflectance = np.random.default_rng(7).gamma(0.5, 0.02, (3, 24, 32, 3))
     places = ((0, -1.0, 0), (0, -2.0, 0.2), (0, 1.0, 0))
     lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(places))
-    capture = shot(tmp_path / "capture", answers, lights, without=("l1",))
+    capture = shot(tmp_path / "capture", reflectance, lights, without=("l1",))
     lighting = Viewed(model, capture).lighting
     assert lighting.about()["missing"] == {"c": 1}
     png = lighting.sum("c", {i: [1, 2, 3] for i in range(3)}, exposure=1.3)
     found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
     # l1 is twice as far: over 4.04 squared metres
-    x = np.clip(1.3 * np.array((1, 2, 3)) * (answers[0] * (1 + 1 / 4.04) + answers[2]), 0, 1)
+    x = np.clip(
+        1.3 * np.array((1, 2, 3)) * (reflectance[0] * (1 + 1 / 4.04) + reflectance[2]), 0, 1
+    )
     shown = 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     assert np.abs(found - shown).max() < 0.51
 
@@ -93,8 +95,8 @@ def test_lights_shine_as_inverse_rendering_found_them(model, tmp_path):
     lights = tuple(Light(f"l{i}", p, (4, 4, 4)) for i, p in enumerate(places))
     save_lights(model, np.array([0.5, 1, 1]), lights)
     lighting = Viewed(model, shot(tmp_path / "capture", np.ones((3, 24, 32, 3)), lights)).lighting
-    (told,) = lighting.few({0: [1, 1, 1]})
-    np.testing.assert_allclose(told["intensity"], 2)
+    (description,) = lighting.few({0: [1, 1, 1]})
+    np.testing.assert_allclose(description["intensity"], 2)
 
 
 def test_all_lights_together_are_the_captured_frame_of_all(model, tmp_path):
@@ -103,13 +105,13 @@ def test_all_lights_together_are_the_captured_frame_of_all(model, tmp_path):
     rng = np.random.default_rng(5)
     lights = tuple(Light(f"l{i}", p, (1, 1, 1)) for i, p in enumerate(dome_positions(12, 1.3)))
     camera = Camera.look_at("c", 32, 24, (0, -1, 0), (0, 0, 0), 20.0)
-    answers = rng.gamma(0.5, 0.02, (12, 24, 32, 3))
+    reflectance = rng.gamma(0.5, 0.02, (12, 24, 32, 3))
     olat = [Step(1 + i, "olat", 0.02, 0.5, light=x.name) for i, x in enumerate(lights)]
     steps = [Step(0, "all_on", 0.005, 0.25), *olat]
     writer = CaptureWriter.create(
         tmp_path / "capture", Rig("r", (camera,), lights), {"steps": steps}
     )
-    for step, radiance in zip(steps, (answers.sum(axis=0), *answers), strict=True):
+    for step, radiance in zip(steps, (reflectance.sum(axis=0), *reflectance), strict=True):
         writer.write_frame(step, "c", (step.level * radiance).astype(np.float32))
     writer.finish("completed", {})
     capture = Capture(tmp_path / "capture")

@@ -39,11 +39,11 @@ def test_it_is_the_path_tracers_light_of_hair_and_of_head(scene):
     share = coverage(scene, CAMERA, 64)
     assert ((found[0, ..., 3] > 0) == (found[1, ..., 3] > 0)).all()  # something is known of all
     for part, other_part, kind in zip(found, found[::-1], ("hair", "head"), strict=True):
-        seen = part[..., 3] > other_part[..., 3]
-        assert np.abs(part[seen, 3] - share[kind][seen]).mean() < 0.1
-        total = (one + other)[seen].sum(axis=0) / 2
-        np.testing.assert_allclose(part[seen, :3].sum(axis=0), total, rtol=0.15)
-        much = seen & (part[..., 3] > 0.5)
+        visible = part[..., 3] > other_part[..., 3]
+        assert np.abs(part[visible, 3] - share[kind][visible]).mean() < 0.1
+        total = (one + other)[visible].sum(axis=0) / 2
+        np.testing.assert_allclose(part[visible, :3].sum(axis=0), total, rtol=0.15)
+        much = visible & (part[..., 3] > 0.5)
         a, b, light = one[much], other[much], part[much, :3]
         even = (a + b).mean(axis=0) / 2
         error = ((light - a) * (light - b)).mean()  # free of their noise

@@ -20,11 +20,11 @@ STRANDS = "/view/models/bristles/strands/model"
 
 
 def test_strands_come_back_in_metres(http, model):
-    told = http.get("/view/models/bristles").json()["strands"]["model"]
-    n = told["points"]
-    data = http.get(STRANDS, params={"count": told["count"]}).content
-    packed = np.frombuffer(data, "<u2", told["count"] * n * 3).reshape(-1, n, 3)
-    places = np.array(told["low"]) + told["step"] * packed
+    description = http.get("/view/models/bristles").json()["strands"]["model"]
+    n = description["points"]
+    data = http.get(STRANDS, params={"count": description["count"]}).content
+    packed = np.frombuffer(data, "<u2", description["count"] * n * 3).reshape(-1, n, 3)
+    places = np.array(description["low"]) + description["step"] * packed
     strands = model.strands()
     ends = strands.points[strands.offsets[1:] - 1]
     nearest = np.linalg.norm(places[:, -1][:, None] - ends[None], axis=-1).min(axis=0)
@@ -84,9 +84,9 @@ def test_confidence_is_the_distance_to_measured_points(http, model: Model):
         *(np.zeros((n, 2)), zeros, zeros, zeros, zeros, ones, ones, ("a",), ("b",)),
     )
     model.write_points(cloud)
-    told = http.get("/view/models/bristles").json()["strands"]["model"]
+    description = http.get("/view/models/bristles").json()["strands"]["model"]
     level = np.frombuffer(http.get("/view/models/bristles/confidence").content, np.uint8)
-    level = level.reshape(-1, told["points"])
+    level = level.reshape(-1, description["points"])
     order = PackedStrands.of(strands).order
     own = level[np.flatnonzero(order == 7)[0]]
     assert own.min() >= 240
@@ -125,9 +125,9 @@ def test_a_map_that_unpacks_to_gigabytes_takes_no_memory_of_the_service(http):
         expected = f"{name}: the image unpacks to {size} pixels; at most 8,388,608 are read"
 
         def refused(name: str = name, data: bytes = data, expected: str = expected) -> None:
-            answer = http.put(f"/view/models/bristles/environments/{name}", content=data)
-            assert answer.status_code == 422
-            assert answer.json()["detail"] == expected
+            response = http.put(f"/view/models/bristles/environments/{name}", content=data)
+            assert response.status_code == 422
+            assert response.json()["detail"] == expected
 
         assert bombs.peak_mb(refused) < 8 * len(data) / 1e6 + 40
 
@@ -136,15 +136,15 @@ def test_a_view_that_is_none_is_refused_before_a_path_is_traced(http):
     lens = [[100, 0, 5], [0, 100, 5], [0, 0, 1]]
     view = {"width": 9, "height": 9, "K": lens, "R": np.eye(3).tolist(), "t": [0, 0, 1]}
 
-    def asked(**what):
+    def request_body(**what):
         body = {"weights": {"4": [1, 1, 1]}, "view": {**view, **what}}
-        answer = http.post("/view/models/bristles/indirect/view", json=body)
-        return answer.status_code, answer.json()["detail"]
+        response = http.post("/view/models/bristles/indirect/view", json=body)
+        return response.status_code, response.json()["detail"]
 
-    assert asked()[0] == 404  # no material was fitted
-    assert asked(R=[[1, 0, 0], [0, 1, 0], [0, 1, 1]])[0] == 422
-    assert asked(width=0)[0] == 422
-    status, detail = asked(width=1000, height=101)
+    assert request_body()[0] == 404  # no material was fitted
+    assert request_body(R=[[1, 0, 0], [0, 1, 0], [0, 1, 1]])[0] == 422
+    assert request_body(width=0)[0] == 422
+    status, detail = request_body(width=1000, height=101)
     assert status == 422
     assert "101000" in detail
 

@@ -54,7 +54,7 @@ GROOMS = {"fibre": fibre, "bundle": bundle}
 
 
 @dataclass
-class Seen:
+class ViewerPage:
     """A page, what it complained of, and the hosts that it asked."""
 
     page: Any
@@ -73,11 +73,11 @@ class Seen:
         self.drawn("viewer.relight")
         self.page.evaluate("() => { viewer.frame = () => {}; }")
         self.page.select_option("select >> nth=0", "lit")
-        self.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
-        told = self.page.evaluate(
+        self.page.wait_for_function("viewer.relight.visibility", timeout=PATIENCE_MS)
+        values = self.page.evaluate(
             "(() => { const { K, R, t } = viewer.orbit.pinhole(96, 96); return { K, R, t }; })()"
         )
-        camera = Camera("orbit", 96, 96, *(np.array(told[k]) for k in "KRt"))
+        camera = Camera("orbit", 96, 96, *(np.array(values[k]) for k in "KRt"))
         eye = camera.center
         ways = np.array([x.position / np.linalg.norm(x.position) for x in lights])
         places = (eye, np.cross(eye, [0, 0, 1.0]), -eye)
@@ -87,11 +87,11 @@ class Seen:
         """The picture at rest `(96, 96, 3)` under one light, radiance."""
         self.page.evaluate(f"viewer.relight.set({{{number}: [1, 1, 1]}})")
         self.page.wait_for_function(
-            f"!viewer.relight.under && viewer.relight.lights[0]?.number === {number}",
+            f"!viewer.relight.applying && viewer.relight.lights[0]?.number === {number}",
             timeout=PATIENCE_MS,
         )
-        told = self.page.evaluate(AT_REST, ambient)
-        return np.array(told, np.float32).reshape(96, 96, 4)[::-1, :, :3]
+        values = self.page.evaluate(AT_REST, ambient)
+        return np.array(values, np.float32).reshape(96, 96, 4)[::-1, :, :3]
 
     def drawn(self, what: str = "true") -> None:
         """Wait until everything is there and drawn, and `what` holds."""
@@ -116,82 +116,87 @@ def model(tmp_path, request):
 
 
 @pytest.fixture
-def seen(url: str) -> Iterator[Seen]:
-    with visited(url, bypass_csp=True) as seen:  # waiting for an expression needs eval
-        yield seen
+def viewer_page(url: str) -> Iterator[ViewerPage]:
+    with visited(url, bypass_csp=True) as viewer_page:  # waiting for an expression needs eval
+        yield viewer_page
 
 
 @contextmanager
-def visited(url: str, **more: Any) -> Iterator[Seen]:
+def visited(url: str, **more: Any) -> Iterator[ViewerPage]:
     arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with api.sync_playwright() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=arguments, timeout=PATIENCE_MS)
         page = browser.new_page(viewport={"width": 900, "height": 500}, **more)
-        seen = Seen(page)
-        page.on("console", lambda m: seen.complaints.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda e: seen.complaints.append(str(e)))
-        page.on("request", lambda r: seen.hosts.add(r.url.partition("://")[2].partition("/")[0]))
+        viewer_page = ViewerPage(page)
+        page.on(
+            "console",
+            lambda m: viewer_page.complaints.append(m.text) if m.type == "error" else None,
+        )
+        page.on("pageerror", lambda e: viewer_page.complaints.append(str(e)))
+        page.on(
+            "request", lambda r: viewer_page.hosts.add(r.url.partition("://")[2].partition("/")[0])
+        )
         page.goto(f"{url}/view#model=bristles&token=the%20key", timeout=PATIENCE_MS)
-        yield seen
+        yield viewer_page
         browser.close()
 
 
 def test_the_page_needs_nothing_that_its_policy_refuses(url):
-    with visited(url) as seen:
+    with visited(url) as viewer_page:
         done = "Boolean(window.viewer?.complete && viewer.picture.ready() && viewer.picture.frames)"
-        until(lambda: seen.page.evaluate(done), pause=0.1)
-        assert (seen.picture()[..., 3] > 0).any()
-        seen.page.select_option("select >> nth=0", "length")
-        assert seen.complaints == []
+        until(lambda: viewer_page.page.evaluate(done), pause=0.1)
+        assert (viewer_page.picture()[..., 3] > 0).any()
+        viewer_page.page.select_option("select >> nth=0", "length")
+        assert viewer_page.complaints == []
 
 
-def test_strands_are_drawn_turn_and_take_another_colour(seen, url):
-    seen.drawn()
-    assert "400 strands" in seen.page.inner_text("#panel")
-    before = seen.picture()
+def test_strands_are_drawn_turn_and_take_another_colour(viewer_page, url):
+    viewer_page.drawn()
+    assert "400 strands" in viewer_page.page.inner_text("#panel")
+    before = viewer_page.picture()
     # a half ball of 13 cm, whole in the picture
     assert 0.05 < (before[..., 3] > 0).mean() < 0.75
-    seen.page.focus("#canvas")
-    seen.page.keyboard.press("ArrowLeft")
-    seen.page.wait_for_function("viewer.orbit.azimuth > -50", timeout=PATIENCE_MS)
-    seen.drawn()
-    assert np.abs(seen.picture().astype(int) - before).mean() > 1
+    viewer_page.page.focus("#canvas")
+    viewer_page.page.keyboard.press("ArrowLeft")
+    viewer_page.page.wait_for_function("viewer.orbit.azimuth > -50", timeout=PATIENCE_MS)
+    viewer_page.drawn()
+    assert np.abs(viewer_page.picture().astype(int) - before).mean() > 1
 
-    seen.page.select_option("select >> nth=0", "length")
-    seen.page.select_option("select >> nth=1", "truth")
-    seen.drawn("viewer.picture.state.mode === 'length'")
-    hair = seen.picture()
+    viewer_page.page.select_option("select >> nth=0", "length")
+    viewer_page.page.select_option("select >> nth=1", "truth")
+    viewer_page.drawn("viewer.picture.state.mode === 'length'")
+    hair = viewer_page.picture()
     yellow = (hair[..., 2] > 1.5 * hair[..., 0]) & (hair[..., 1] > 1.5 * hair[..., 0])
     assert yellow.sum() > 500  # all are as long as the longest
-    assert seen.complaints == []
-    assert seen.hosts == {url.partition("://")[2]}
-    assert "token" not in seen.page.evaluate("location.href")
+    assert viewer_page.complaints == []
+    assert viewer_page.hosts == {url.partition("://")[2]}
+    assert "token" not in viewer_page.page.evaluate("location.href")
 
 
 @pytest.mark.parametrize(
     ("model", "allowed"), [("fibre", 0.015), ("bundle", 0.035)], indirect=["model"]
 )
-def test_direct_light_is_that_of_the_path_tracer(seen, model, viewing, allowed):
+def test_direct_light_is_that_of_the_path_tracer(viewer_page, model, viewing, allowed):
     """From in front, from the side, from behind; the picture's sum beside paths of one vertex."""
     lighting = viewing.get("bristles").lighting
-    camera, _, numbers = seen.lit(lighting.lights)
+    camera, _, numbers = viewer_page.lit(lighting.lights)
     scene = FittedModel.load(model).scene()
     expected = render_olat(
         scene, camera, [lighting.lights[n] for n in numbers], spp=256, max_depth=1, thrift=0
     )
     for number, picture in zip(numbers, expected, strict=True):
-        found = seen.at_rest(number, 0)
+        found = viewer_page.at_rest(number, 0)
         np.testing.assert_allclose(found.sum(axis=(0, 1)), picture.sum(axis=(0, 1)), rtol=allowed)
-    assert seen.complaints == []
+    assert viewer_page.complaints == []
 
 
 @pytest.mark.parametrize("model", ["bundle"], indirect=True)
-def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(seen, model, viewing):
+def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(viewer_page, model, viewing):
     """From the side: which pixels have it, and how much of it there is. The bundle is much the same
     upside down, its light is not."""
     lighting = viewing.get("bristles").lighting
-    camera, _, (_, side, _) = seen.lit(lighting.lights)
-    found = seen.at_rest(side, 1) - seen.at_rest(side, 0)
+    camera, _, (_, side, _) = viewer_page.lit(lighting.lights)
+    found = viewer_page.at_rest(side, 1) - viewer_page.at_rest(side, 0)
     pixels = np.arange(96 * 96)
     scene, light = FittedModel.load(model).scene(), [lighting.lights[side]]
     expected = render_indirect(scene, camera, light, pixels, spp=192, max_depth=24)
@@ -200,28 +205,30 @@ def test_at_rest_light_between_fibres_is_that_of_the_path_tracer(seen, model, vi
     assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.85
     for flipped in (expected[::-1], expected[:, ::-1]):
         assert np.corrcoef(found.ravel(), flipped.ravel())[0, 1] < 0.8
-    assert seen.complaints == []
+    assert viewer_page.complaints == []
 
 
 @pytest.mark.parametrize("model", ["fibre"], indirect=True)
-def test_the_truth_has_its_own_colours_in_whatever_exposure_the_model_is_lit(seen, model):
+def test_the_truth_has_its_own_colours_in_whatever_exposure_the_model_is_lit(viewer_page, model):
     """In motion and at rest: directions are red, green and blue of the same brightness."""
 
     def shown() -> list[np.ndarray]:
-        return [np.array(seen.page.evaluate(SHOWN, rests), np.uint8) for rests in (False, True)]
+        return [
+            np.array(viewer_page.page.evaluate(SHOWN, rests), np.uint8) for rests in (False, True)
+        ]
 
-    seen.drawn("viewer.relight")
-    seen.page.evaluate("() => { viewer.frame = () => {}; }")
-    seen.page.select_option("select >> nth=1", "truth")
+    viewer_page.drawn("viewer.relight")
+    viewer_page.page.evaluate("() => { viewer.frame = () => {}; }")
+    viewer_page.page.select_option("select >> nth=1", "truth")
     unlit = shown()
-    seen.page.select_option("select >> nth=0", "lit")
-    seen.page.wait_for_function("viewer.relight.seen", timeout=PATIENCE_MS)
+    viewer_page.page.select_option("select >> nth=0", "lit")
+    viewer_page.page.wait_for_function("viewer.relight.visibility", timeout=PATIENCE_MS)
     for exposure in (8, 0.1):
-        seen.page.evaluate(f"() => {{ viewer.picture.state.exposure = {exposure}; }}")
+        viewer_page.page.evaluate(f"() => {{ viewer.picture.state.exposure = {exposure}; }}")
         for expected, found in zip(unlit, shown(), strict=True):
             assert expected.any()
             assert np.abs(found.astype(int) - expected).mean() < 1
-    assert seen.complaints == []
+    assert viewer_page.complaints == []
 
 
 SHOWN = """(rests) => {
@@ -247,10 +254,10 @@ AT_REST = """async (ambient) => {
 }"""
 
 
-def test_a_light_that_is_shaded_keeps_its_shadows_when_another_comes(seen):
+def test_a_light_that_is_shaded_keeps_its_shadows_when_another_comes(viewer_page):
     """24 lights one after the other, then the first of them beside a new one."""
-    told = seen.page.evaluate(SHADE_25)
-    assert told == {"error": "", "latest": [23, 0, 24], "size": 24}
+    values = viewer_page.page.evaluate(SHADE_25)
+    assert values == {"error": "", "latest": [23, 0, 24], "size": 24}
 
 
 SHADE_25 = """async () => {
@@ -259,7 +266,7 @@ SHADE_25 = """async () => {
     const gl = { deleteTexture() {} }, picture = { sets: { model: hair } };
     const relight = Object.create(Relight.prototype);
     Object.assign(relight, {
-        viewer: { gl, picture, status() {}, draw() {} }, kept: new Map(),
+        viewer: { gl, picture, status() {}, draw() {} }, cache: new Map(),
     });
     const asked = window.fetch;
     let shaded, error = "";
@@ -273,5 +280,5 @@ SHADE_25 = """async () => {
         shaded = [0, 24];
         await relight.shade({});
     } catch (e) { error = e.message; }
-    return { error, latest: [...relight.kept.keys()].slice(-3), size: relight.kept.size };
+    return { error, latest: [...relight.cache.keys()].slice(-3), size: relight.kept.size };
 }"""

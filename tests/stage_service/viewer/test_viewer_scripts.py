@@ -22,7 +22,7 @@ globalThis.document = { getElementById: () => ({ decode() {} }) };
 const said = [];
 const viewer = { picture: { state: { exposure: 1 } }, status: (x) => said.push(x), draw() {} };
 const { Relight } = await import("./relight.js");
-const relight = Object.assign(Object.create(Relight.prototype), { viewer, told: { missing: {} } });
+const relight = Object.assign(Object.create(Relight.prototype), { viewer, data: { missing: {} } });
 """
 
 
@@ -44,25 +44,25 @@ def run(tmp_path: Path) -> Any:
     return ran
 
 
-def test_frames_are_asked_for_by_whatever_name_a_camera_has(run):
+def test_frames_are_requested_by_any_camera_name(run):
     name = "cam #1, 50% left?"
-    asked = run(
+    requested = run(
         BROWSER
         + f"""
         globalThis.fetch = async (path) => {{ out = path; return new Response("x"); }};
         await relight.showSum({json.dumps(name)}, {{}});"""
     )
-    parts = urlsplit(asked)
+    parts = urlsplit(requested)
     assert unquote(parts.path) == f"/view/models/m/sums/{name}.png"
     assert (parts.query, parts.fragment) == ("", "")
 
 
-def test_frames_that_are_missing_are_told(run):
+def test_missing_frames_are_reported(run):
     said = run(
         BROWSER
         + """
         globalThis.fetch = async () => new Response("x");
-        relight.told.missing = { a: 2 };
+        relight.data.missing = { a: 2 };
         for (const camera of ["b", "a"]) await relight.showSum(camera, {});
         out = said;"""
     )
@@ -112,7 +112,7 @@ def test_a_camera_chosen_before_light_is_there_shows_its_frames(run):
         (["EXT_color_buffer_float", "EXT_float_blend"], "RGBA32F"),
         (["EXT_color_buffer_float", "EXT_color_buffer_half_float"], "RGBA16F"),
         (["EXT_color_buffer_half_float"], "RGBA16F"),
-        ([], "draws no floats"),
+        ([], "needs float textures"),
     ],
 )
 def test_pictures_are_added_up_in_what_the_card_can_blend(run, there, expected):

@@ -90,12 +90,12 @@ class Desk:
         """
         while True:
             until(lambda: self.http.get("/health").json()["capture"] is None)
-            answer = self.http.post("/captures", json={"plan": LIT}, headers=self.lease)
-            assert answer.status_code == 202, answer.text
-            path = f"/captures/{answer.json()['id']}"
+            response = self.http.post("/captures", json={"plan": LIT}, headers=self.lease)
+            assert response.status_code == 202, response.text
+            path = f"/captures/{response.json()['id']}"
             until(lambda path=path: self.lit or self.http.get(path).json()["outcome"])
             if self.lit:
-                return str(answer.json()["id"])
+                return str(response.json()["id"])
 
     def outcome(self, capture: str) -> str:
         """How a capture that is about to end has ended."""
@@ -120,9 +120,9 @@ class Desk:
         self.lease = {}
         for pages in self._opened:
             pages.close()
-        told = [text for pages in self._opened for text in pages.complaints]
+        messages = [text for pages in self._opened for text in pages.complaints]
         self._opened.clear()
-        assert [x for x in told if not any(y in x for y in EXPECTED_COMPLAINTS)] == []
+        assert [x for x in messages if not any(y in x for y in EXPECTED_COMPLAINTS)] == []
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ def token_revoked(desk: Desk) -> Any:
     return page
 
 
-ANSWERED = {
+RESPONDING = {
     state.__name__: state
     for state in (
         second_tab,
@@ -231,10 +231,10 @@ ANSWERED = {
 
 @pytest.mark.parametrize(
     ("press", "state"),
-    [((f9, button)[k % 2], state) for k, state in enumerate(ANSWERED)],
+    [((f9, button)[k % 2], state) for k, state in enumerate(RESPONDING)],
 )
-def test_blackout_where_the_service_answers(press, state, desk, film):
-    page = ANSWERED[state](desk)
+def test_blackout_while_the_service_responds(press, state, desk, film):
+    page = RESPONDING[state](desk)
     film.take(page, f"{state}_before", sizes=SHOWN, brightest=2 * BRIGHTEST)
     press(page)
     page.wait_for_selector("#notices:has-text('Dark, verified'), .alarm:has-text('Dark, verified')")
@@ -280,12 +280,12 @@ def test_a_lamp_that_stays_lit_is_named_when_blackout_is_pressed(stage, film):
     assert film.wrong == [], "\n".join(film.wrong)
 
 
-def no_answer(page: Any, desk: Desk) -> None:
+def no_response(page: Any, desk: Desk) -> None:
     """The page claims nothing of now while nothing comes from the service."""
     page.wait_for_selector("h1:has-text('No response since')")
     page.wait_for_selector("circle.light.lit", state="detached")
     alarm = page.text_content(".alarm:has-text('No response from the service since')")
-    assert "the light bank's watchdog puts the lamps off" in alarm
+    assert "the light bank's watchdog switches the lamps off" in alarm
     assert f"{desk.watchdog_s:g} s after the service's last heartbeat" in alarm
     for claim in ("Dark, verified", "Shooting"):
         assert not page.is_visible(f"h1:has-text({claim!r})")
@@ -301,11 +301,11 @@ def frozen_or_dead(desk: Desk, *presses: Callable[[Any], None]) -> dict[Callable
     return pages
 
 
-def press_unanswered(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> None:
-    """The service has just stopped: the bank's watchdog puts the lamps off, no page claims to."""
+def press_without_response(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> None:
+    """The service has just stopped: the watchdog switches the lamps off; no page claims it."""
     until(lambda: not desk.lit)
     for press, page in pages.items():
-        no_answer(page, desk)
+        no_response(page, desk)
         press(page)
     for page in pages.values():
         alarm = page.wait_for_selector(".alarm:has-text('has had no response for')")
@@ -313,10 +313,10 @@ def press_unanswered(desk: Desk, pages: dict[Callable[[Any], None], Any]) -> Non
 
 
 @pytest.mark.parametrize("login", ["kept", pytest.param("ended", marks=pytest.mark.slow)])
-def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
+def test_blackout_is_repeated_until_a_restarted_service_responds(login, desk, film):
     pages = frozen_or_dead(desk, button)
     desk.kill()
-    press_unanswered(desk, pages)
+    press_without_response(desk, pages)
     if login == "kept":
         film.take(pages[button], "no_connection", sizes=SHOWN, brightest=2 * BRIGHTEST)
     else:
@@ -341,10 +341,10 @@ def test_blackout_is_sent_until_a_service_that_died_answers(login, desk, film):
     assert film.wrong == [], "\n".join(film.wrong)
 
 
-def test_blackout_over_a_frozen_service_is_shown_as_not_answered(desk, film):
+def test_blackout_over_a_frozen_service_is_shown_without_a_response(desk, film):
     pages = frozen_or_dead(desk, f9)
     desk.process.send_signal(signal.SIGSTOP)
-    press_unanswered(desk, pages)
+    press_without_response(desk, pages)
     film.take(pages[f9], "frozen", sizes=SHOWN, brightest=2 * BRIGHTEST)
     desk.process.send_signal(signal.SIGCONT)
     for page in pages.values():

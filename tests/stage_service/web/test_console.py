@@ -52,7 +52,7 @@ def test_a_capture_from_its_plan_to_darkness(console):
     done = http.get(f"/captures/{running.id}").json()
     assert (done["state"], done["outcome"]) == ("done", "aborted")
     assert 0 < done["frames_written"] < done["frames_planned"]
-    assert "was aborted" in page.text_content(".said")
+    assert "was aborted" in page.text_content(".status")
 
     page.click("nav >> text=Frames")
     picture = page.wait_for_selector("figure img[src]")
@@ -114,7 +114,7 @@ def test_a_capture_by_the_keyboard_alone(console):
     assert http.service.captures(1)[0].outcome == "aborted"
 
 
-def test_a_slow_step_says_how_many_cameras_have_answered(console, monkeypatch):
+def test_a_slow_step_shows_how_many_cameras_have_responded(console, monkeypatch):
     make, go_on = FrameMaker.counts, Event()
 
     def slow(self, camera, shot, exposure):
@@ -186,7 +186,7 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     http, pages = console(rig=small_rig.replace("[devices.lights]", UNREAD))
     page = pages.open()
 
-    def told(headline: str, bar: str, lit: str) -> str:
+    def alarms_with(headline: str, bar: str, lit: str) -> str:
         """What stands above the view, once the rest is as it should be."""
         says(page, headline)
         page.wait_for_selector(f"#top .state:text-is({bar!r})")
@@ -197,7 +197,7 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
     http.post("/captures", json={"plan": {**PACED, "lights": ["light_003"]}})
     until(lambda: http.service.captures(1)[0].state == "done")
     sent = "off was sent; the light bank cannot report what is lit"
-    alarm = told("Off was sent, not read back", "off was sent", sent)
+    alarm = alarms_with("Off was sent, not read back", "off was sent", sent)
     assert "the light bank cannot report whether the lamps are off" in alarm
     assert "A blackout cannot verify it: inspect the stage before anybody enters." in alarm
     page.click("nav >> text=Stage")
@@ -209,33 +209,35 @@ def test_nothing_is_called_dark_that_was_not_read_back(console, small_rig):
 
     stage = http.service._captures.stage
     stage.learn(Blackout(False, "unknown, unsafe: lights: no answer."))
-    alarm = told("UNSAFE", "unsafe", "not known what is lit")
+    alarm = alarms_with("UNSAFE", "unsafe", "not known what is lit")
     assert "This light bank cannot report whether its lamps are off" in alarm
     page.fill("[name=name]", "Ada")
     page.fill("[name=note]", "all dark")
     page.click("text=I looked")
-    assert not told(
-        "Said to be dark", "said to be dark", "no lamp is lit, as a person who looked reports"
+    assert not alarms_with(
+        "Reported dark by a person",
+        "reported by a person",
+        "no lamp is lit, as a person at the stage reports",
     )
     page.keyboard.press("F9")
-    assert "A blackout cannot verify it" in told(
+    assert "A blackout cannot verify it" in alarms_with(
         "Off was sent, not read back", "off was sent", sent
     )
 
 
-def test_a_blackout_for_which_there_is_no_room_is_asked_again(console):
+def test_a_blackout_refused_with_503_is_repeated(console):
     http, pages = console()
     page = pages.open()
     says(page, "Dark, verified")
     left = [503, 503]  # as where all connections are taken
 
-    def answer(route: Any) -> None:
+    def respond(route: Any) -> None:
         if left:
             route.fulfill(status=left.pop(), body="")
         else:
             route.continue_()
 
-    page.route("**/devices/blackout", answer)
+    page.route("**/devices/blackout", respond)
     page.keyboard.press("F9")
     page.wait_for_selector(".notice:has-text('dark, verified')")
     assert [a.action for a in http.service.audit(10)] == ["blackout"]
@@ -309,12 +311,12 @@ def test_what_was_shot_at_last_is_missing_no_more(console):
     page.wait_for_selector(".missing:has-text('cam_b — given up')")
     page.keyboard.press("F8")
     page.click("button:text-is('Shoot what is missing')")
-    page.wait_for_selector(".said:has-text('is complete')")
+    page.wait_for_selector(".status:has-text('is complete')")
     assert http.service.captures(1)[0].frames_missing == 0
     page.wait_for_selector(".missing li:text-is('none')")
 
 
-def test_what_waits_is_put_elsewhere(console):
+def test_queued_captures_are_reordered(console):
     http, pages = console()
     http.post("/queue:hold")
     names = [f"light_{n:03d}" for n in range(3)]
@@ -364,7 +366,7 @@ def test_a_page_that_is_opened_in_a_pause_shows_the_capture_that_is_paused(conso
     until(lambda: http.service.capture(older).outcome == "aborted")
 
 
-def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
+def test_a_bank_that_dies_in_a_pause_is_reported_and_resumes_after_repair(
     rig_file, world, tmp_path, browser
 ):
     with serving(rig_file, tmp_path / "root") as http:
@@ -374,10 +376,10 @@ def test_a_bank_that_dies_in_a_pause_is_told_and_one_that_is_mended_goes_on(
         page.click("button:text-is('Pause')")
         says(page, "Paused")
         world.deaf_lights = True
-        page.wait_for_selector(".said b.bad:has-text('Remove the cause first')")
+        page.wait_for_selector(".status b.bad:has-text('Remove the cause first')")
         assert "light bank" in http.get(f"/captures/{id_}").json()["error"]
         world.deaf_lights = False
-        page.wait_for_selector(".said b.bad", state="detached")
+        page.wait_for_selector(".status b.bad", state="detached")
         page.click("button:text-is('Resume')")
         says(page, "Shooting")
         page.keyboard.press("F8")
@@ -394,30 +396,30 @@ def test_what_is_removed_elsewhere_is_shown_no_more(console):
         ids.append(http.post("/captures", json={"plan": short}).json()["id"])
         until(lambda: http.service.capture(ids[-1]).outcome == "completed")
     now, frames = pages.open(), pages.open("frames")
-    now.wait_for_selector(f".said:has-text({ids[1]!r})")
+    now.wait_for_selector(f".status:has-text({ids[1]!r})")
     frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
     loaded = "[...document.querySelectorAll('figure img')].filter(x => x.naturalWidth).length"
     until(lambda: frames.evaluate(loaded) == 2)  # no picture is asked for that is gone
     removed = http.delete(f"/captures/{ids[1]}").json()["name"]
-    now.wait_for_selector(f".said:has-text({ids[0]!r})")
+    now.wait_for_selector(f".status:has-text({ids[0]!r})")
     frames.wait_for_selector(f".list button:has-text({ids[1]!r})", state="detached")
     frames.wait_for_selector(f"h2:has-text({ids[0]!r})")
     until(lambda: frames.evaluate(loaded) == 2)
     http.post(f"/trash/{removed}/restore").raise_for_status()
-    now.wait_for_selector(f".said:has-text({ids[1]!r})")
+    now.wait_for_selector(f".status:has-text({ids[1]!r})")
     frames.wait_for_selector(f".list button:has-text({ids[1]!r})")
 
 
-def test_an_open_job_shows_what_its_end_left_and_is_run_again_as_it_was_asked_for(console):
+def test_an_open_job_shows_its_files_at_its_end_and_runs_again_with_its_options(console):
     http, pages = console()
     plan = {"lights": [], "projectors": []}
     capture = http.post("/captures", json={"plan": plan}).json()["id"]
     until(lambda: http.service.capture(capture).outcome == "completed")
     pipeline = {"name": "reconstruct", "priority": 8, "retries": 2, "timeout_s": 3600.5}
-    asked = {"capture": capture, "pipeline": pipeline, "model": "mine"}
-    job = http.post("/jobs", json=asked).json()["id"]
+    job_request = {"capture": capture, "pipeline": pipeline, "model": "mine"}
+    job = http.post("/jobs", json=job_request).json()["id"]
     page = pages.open(f"jobs/{job}")
-    page.wait_for_selector(".said:has-text('Queued until a worker is free.')")
+    page.wait_for_selector(".status:has-text('Queued until a worker is free.')")
     Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
     http.delete(f"/jobs/{job}").raise_for_status()
     page.wait_for_selector("dd:text-is('cancelled')")

@@ -32,7 +32,7 @@ PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
 
 AT_REST = """() => {
   const { relight, picture } = viewer;
-  const still = relight.rest?.textures && !relight.under;
+  const still = relight.rest?.textures && !relight.applying;
   return still && picture.samples >= Math.max(8, picture.cycle());
 }"""
 
@@ -112,7 +112,7 @@ def test_a_capture_as_a_film(hold, console, film, demo, demo_rig):
     page.wait_for_selector(".cost:has-text('8 Hz')")
     film.take(page, "plan_with_cost")
     page.fill("[name=lights]", "light_400")
-    page.wait_for_selector("text=This plan cannot be shot")
+    page.wait_for_selector("text=This plan cannot be captured")
     film.take(page, "plan_that_cannot_be")
     pages.complaints.clear()  # Chromium's own, of the refusal
     page.fill("[name=lights]", "")

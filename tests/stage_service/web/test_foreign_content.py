@@ -73,8 +73,8 @@ def hostile(rig_file, tmp_path) -> Iterator[tuple[Client, str, str]]:
         plan = {"lights": ["light_003"], "projectors": []}
         capture = http.post("/captures", json={"plan": plan}).json()["id"]
         http.service._captures.wait(capture, 60)
-        asked = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "m"}
-        job = http.post("/jobs", json=asked).json()["id"]
+        job_request = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "m"}
+        job = http.post("/jobs", json=job_request).json()["id"]
         model = Model(http.service.root / "models" / "m").create().path
         (model / "plots").mkdir()
         for name, data in FILES.items():

@@ -8,7 +8,7 @@ from stage_service.records.attempts import FREE
 from stage_service.records.tokens import Tokens
 
 
-def test_whoever_is_not_logged_in_is_asked_to(simulated, browser, tmp_path):
+def test_a_page_without_a_login_shows_the_login_form(simulated, browser, tmp_path):
     access = Access(Tokens(tmp_path / "none", "the key"))
     with serving(simulated()[0], tmp_path / "root", access, all_read=False) as http:
         pages = Pages(browser, str(http.base_url).rstrip("/"))

@@ -1,4 +1,4 @@
-// Requests to the API: JSON, problems as errors.
+// Requests to the API: JSON bodies; problem documents become errors.
 
 import { local } from "./dom.js";
 
@@ -11,7 +11,7 @@ export class Problem extends Error {
   }
 }
 
-/** The lease that this page holds: {token, holder}; a page that is loaded again has it still. */
+/** The lease that this page holds: {token, holder}; a reload keeps it. */
 export const own = {
   get lease() { return JSON.parse(sessionStorage.getItem("lease") ?? "null"); },
   set lease(lease) {
@@ -20,31 +20,31 @@ export const own = {
   },
 };
 
-/** "word": the service has sent something; "over": nobody is logged in any more. A browser has six connections to a
- * host: "yield" gives up pictures and their figures, so that a blackout has one, "yield all" every GET and the events;
- * "yielded": all of it may be requested again, once what a blackout has ended was read. */
+/** "contact": data arrived from the service; "logged out": the login has ended. A browser opens six connections to a
+ * host. Before a blackout, "yield" aborts images and their figures, "yield all" every GET and the event stream, so that
+ * one connection is free; "yielded": they may be requested again. */
 export const service = new EventTarget();
-export const tell = (kind) => service.dispatchEvent(new Event(kind));
+export const emit = (kind) => service.dispatchEvent(new Event(kind));
 const PATIENCE_MS = 30_000;
 
 const yielding = { "yield": new AbortController(), "yield all": new AbortController() };
 for (const kind of Object.keys(yielding)) {
   service.addEventListener(kind, () => {
-    yielding[kind].abort(new Error("not loaded: the blackout went first"));
+    yielding[kind].abort(new Error("aborted: a blackout had priority"));
     yielding[kind] = new AbortController();
   });
 }
 
-/** `ask("POST /captures", {plan})`. Raises `Problem`, or `TypeError` where nobody answers.
+/** `request("POST /captures", {plan})`. Raises `Problem`, or `TypeError` if the service does not respond.
  *
- * `more`: `signal` ends it, so does "yield" where it `yields`; `patience` is in milliseconds, `headers` are sent besides. */
-export async function ask(what, body, more = {}) {
+ * `more`: `signal` aborts it; `yields`: "yield" aborts it, too; `patience`: timeout in ms; `headers`: further headers. */
+export async function request(what, body, more = {}) {
   const [method, path] = what.split(" ");
   const lease = own.lease;
   const signals = [AbortSignal.timeout(more.patience ?? PATIENCE_MS)];
   if (more.signal) signals.push(more.signal);
   if (method === "GET") signals.push(yielding[more.yields ? "yield" : "yield all"].signal);
-  const answer = await fetch(path, {
+  const response = await fetch(path, {
     method,
     headers: { ...(lease ? { "Hairstage-Lease": lease.token } : {}), ...(body === undefined ? {} : { "content-type": "application/json" }), ...more.headers },
     body: body === undefined ? undefined : JSON.stringify(body),
@@ -53,14 +53,14 @@ export async function ask(what, body, more = {}) {
     priority: more.priority ?? "auto",
     signal: AbortSignal.any(signals),
   });
-  const json = (answer.headers.get("content-type") ?? "").includes("json");
-  const data = json ? await answer.json() : null;
-  if (json) tell("word"); // a proxy's error page is none
-  if (answer.ok) return data;
-  if (answer.status === 401 && what !== "POST /login") tell("over");
-  throw new Problem(answer.status, data ?? {});
+  const json = (response.headers.get("content-type") ?? "").includes("json");
+  const data = json ? await response.json() : null;
+  if (json) emit("contact"); // not for a proxy's error page
+  if (response.ok) return data;
+  if (response.status === 401 && what !== "POST /login") emit("logged out");
+  throw new Problem(response.status, data ?? {});
 }
 
 /** The path of a capture. */
 export const captureAt = (id) => `/captures/${encodeURIComponent(id)}`;
-export const get = (path, more) => ask(`GET ${path}`, undefined, more);
+export const get = (path, more) => request(`GET ${path}`, undefined, more);
