@@ -21,8 +21,8 @@ class Pages:
 
     def open_as(self, token: str, prepare: Callable[[Any], object] = lambda _page: None) -> Any:
         """A page that is logged in by this token; `prepare(page)` is called before it is loaded."""
-        answer = self._context.request.post(f"{self.url}/login", data={"token": token})
-        assert answer.ok, answer.text()
+        response = self._context.request.post(f"{self.url}/login", data={"token": token})
+        assert response.ok, response.text()
         return self.open(prepare=prepare)
 
     def open(self, view: str = "now", prepare: Callable[[Any], object] = lambda _page: None) -> Any:

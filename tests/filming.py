@@ -73,14 +73,16 @@ class Film:
             picture = page.screenshot(
                 path=self.folder / f"{self._taken:02d}_{name}_{size}.png", animations="disabled"
             )
-            told = [*page.evaluate(LOOKED_OVER)]
+            findings = [*page.evaluate(LOOKED_OVER)]
             if (light := luminance(picture)) > brightest:
-                told.append(f"{100 * light:.1f} % of a white screen's light")
+                findings.append(f"{100 * light:.1f} % of a white screen's light")
             if size != "tablet":
                 for found in self._axe.run(page).response["violations"]:
                     nodes = [node["html"][:90] for node in found["nodes"]]
-                    told.append(f"axe {found['impact']} {found['id']} {len(nodes)}: {nodes[:3]}")
-            self.wrong += [f"{name}, {size}: {text}" for text in told]
+                    findings.append(
+                        f"axe {found['impact']} {found['id']} {len(nodes)}: {nodes[:3]}"
+                    )
+            self.wrong += [f"{name}, {size}: {text}" for text in findings]
         page.set_viewport_size(dict(zip(("width", "height"), SIZES["desk"], strict=True)))
 
 

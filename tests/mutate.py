@@ -67,25 +67,25 @@ def main(name: str, count: int, folder: Path) -> None:
     signal.signal(signal.SIGALRM, late)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES, used + MOST_BYTES))
-    told: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     for number in range(count):
         file.write_bytes(bad := damaged(whole, rng))
         print(json.dumps({"at": number}), flush=True)
         signal.alarm(SECONDS)
         try:
             read(file)
-            told["read"] += 1
+            outcomes["read"] += 1
         except TimeoutError as error:
             print(json.dumps({"wrong": number, "why": str(error), "file": bad[:200].hex()}))
         except REFUSED:
-            told["refused"] += 1
+            outcomes["refused"] += 1
         except BaseException as error:
             why = f"{type(error).__name__}: {error}"
             print(json.dumps({"wrong": number, "why": why[:300], "file": bad[:200].hex()}))
         finally:
             signal.alarm(0)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"told": told, "peak_bytes": peak}))
+    print(json.dumps({"outcomes": outcomes, "peak_bytes": peak}))
 
 
 if __name__ == "__main__":

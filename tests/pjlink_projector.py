@@ -46,16 +46,16 @@ class SimulatedProjector:
             self._look()
             match command.partition(" "):
                 case ("%1POWR", _, "?"):
-                    answer = str(self._state)
+                    text = str(self._state)
                 case ("%1POWR", _, "0" | "1" as wanted):
-                    answer = self._switch(wanted == "1")
+                    text = self._switch(wanted == "1")
                 case ("%1POWR", _, _):
-                    answer = "ERR2"
+                    text = "ERR2"
                 case ("%1LAMP", _, "?") if self._lamps:
-                    answer = f"{int(self._hours)} {int(self._lit)}"
+                    text = f"{int(self._hours)} {int(self._lit)}"
                 case _:
-                    answer = "ERR1"
-        return f"{command[:6]}={answer}"
+                    text = "ERR1"
+        return f"{command[:6]}={text}"
 
     @property
     def _lit(self) -> bool:
@@ -141,10 +141,10 @@ class _Connection(socketserver.StreamRequestHandler):
                     return
                 seed, command = "", command.removeprefix(expected)
             fault = self.server.strikes(command)
-            if not self._say(self._answer(command, fault), fault):
+            if not self._say(self._reply(command, fault), fault):
                 return
 
-    def _answer(self, command: str, fault: str | None) -> str:
+    def _reply(self, command: str, fault: str | None) -> str:
         instead = {"busy": "ERR3", "failure": "ERR4", "lie": "OK"}.get(fault or "")
         if instead is not None:
             return f"{command[:6]}={instead}"

@@ -47,7 +47,7 @@ class FrameAccount:
         self.device = device
         self.wrap = wrap
         self.last: int | None = None
-        self.unanswered = 0
+        self.without_frame = 0
         self._ahead: tuple[float, float] | None = None
         self._timed_at = 0.0
 
@@ -57,7 +57,7 @@ class FrameAccount:
 
     def missed(self) -> None:
         """A pulse after which the camera had no frame."""
-        self.unanswered += 1
+        self.without_frame += 1
 
     def arrived(self, block_id: int, left: int = 0) -> None:
         """The frame of the newest pulse, with `left` frames behind it.
@@ -65,8 +65,8 @@ class FrameAccount:
         Raises `IndexShift` when its number does not fit, and when frames are behind it: then
         something else fired the camera.
         """
-        self._advance(block_id, 1 + self.unanswered)
-        self.unanswered = 0
+        self._advance(block_id, 1 + self.without_frame)
+        self.without_frame = 0
         if left:
             raise self._stray(f"{left} behind block id {block_id}")
 
@@ -90,11 +90,11 @@ class FrameAccount:
         self._ahead, self._timed_at = (low, high), requested
 
     def late(self, block_id: int) -> None:
-        """A frame of a pulse that counted as unanswered. Raises `IndexShift` when it cannot be."""
-        if self.unanswered == 0:
+        """A frame of a pulse that was counted as missing. Raises `IndexShift` if it cannot be."""
+        if self.without_frame == 0:
             raise self._stray(f"block id {block_id}")
-        self._advance(block_id, self.unanswered)
-        self.unanswered -= 1
+        self._advance(block_id, self.without_frame)
+        self.without_frame -= 1
 
     def place(self, block_ids: Sequence[int], pulses: int) -> list[int] | None:
         """The pulse that each frame of a hardware-stepped run belongs to, from 0.
@@ -105,9 +105,9 @@ class FrameAccount:
         and for ids that repeat.
         """
         if not block_ids:
-            self.unanswered += pulses
+            self.without_frame += pulses
             return []
-        skipped = self._advance(block_ids[0], pulses + self.unanswered) - 1
+        skipped = self._advance(block_ids[0], pulses + self.without_frame) - 1
         after = [(b - block_ids[0]) % self.wrap for b in block_ids]
         rising = all(a < b for a, b in pairwise(after))
         in_range = all(1 <= b <= self.wrap for b in block_ids)
@@ -115,11 +115,11 @@ class FrameAccount:
             todo = "Something else fired the camera, or it repeats frames."
             raise self._shift(f"at most {pulses} frames with rising numbers", block_ids[-1], todo)
         # Ids that were skipped may have belonged to pulses before this run.
-        start = max(0, skipped - self.unanswered)
-        complete = start + after[-1] == pulses - 1 and (self.unanswered == 0 or start == 0)
+        start = max(0, skipped - self.without_frame)
+        complete = start + after[-1] == pulses - 1 and (self.without_frame == 0 or start == 0)
         places = [start + k for k in after] if complete else None
         self.last = block_ids[-1]
-        self.unanswered = 0 if complete else pulses - 1 - after[-1]
+        self.without_frame = 0 if complete else pulses - 1 - after[-1]
         return places
 
     def _advance(self, block_id: int, most: int) -> int:

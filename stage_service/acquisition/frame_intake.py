@@ -69,7 +69,7 @@ class FrameIntake:
 
     def _read(self, camera: CameraDevice) -> Frame | None:
         frame = camera.read(self._cancel)
-        self._progress.answered()
+        self._progress.responded()
         return frame
 
     def account(self, camera: CameraDevice, frame: Frame | None, pulse: Pulse) -> None:

@@ -45,7 +45,7 @@ class StepDurations:
 class RunProgress:
     """One run over `steps`; `frames` counts each camera's frames from before the run.
 
-    `answered` and `came` may be called from cameras' threads, all else from one thread. `notify`
+    `responded` and `came` may be called from cameras' threads, all else from one thread. `notify`
     is called with the progress, at most every `NOTIFY_S` seconds.
     """
 
@@ -81,7 +81,7 @@ class RunProgress:
             self._step, self._began, self._here = step, self._clock(), 0
         self._publish()
 
-    def answered(self) -> None:
+    def responded(self) -> None:
         """One more camera has replied for the current software-stepped step."""
         with self._lock:
             self._here += 1

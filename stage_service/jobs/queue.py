@@ -57,7 +57,7 @@ SILENT_S = 20
 """Time-out of its acknowledgements."""
 STATEMENT_S = 8
 """Time-out of the service's statements; a worker's have none."""
-UNANSWERED_S = 10.0
+NO_REPLY_S = 10.0
 """While a request has had no response for this long, no other is sent: each blocks a thread."""
 CAUSE = "the job database"
 """The cause in the log."""
@@ -268,7 +268,7 @@ class JobQueue:
         call = object()
         self._calls[call] = time.monotonic()
         try:
-            if not self._lock.acquire(timeout=UNANSWERED_S):
+            if not self._lock.acquire(timeout=NO_REPLY_S):
                 raise TimeoutError("it is still being connected to")
             try:
                 if self._client is None:
@@ -289,7 +289,7 @@ class JobQueue:
     def _silence(self) -> str | None:
         """Why no request may be sent now; None if one may."""
         waits = time.monotonic() - min(list(self._calls.values()), default=math.inf)
-        if waits < UNANSWERED_S:
+        if waits < NO_REPLY_S:
             return None
         return self._sentence(f"a request has had no response for {waits:.0f} s")
 

@@ -12,7 +12,7 @@ def test_every_name_is_what_it_says():
         assert getattr(appearance, name).__name__ == name
 
 
-def test_no_fit_is_imported_before_it_is_asked_for():
+def test_fits_are_imported_on_first_use():
     code = "import sys, appearance; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "appearance.bsdf" in done.stdout.split()

@@ -32,8 +32,8 @@ def picture_model(
     panels = figure.subplots(1, 4)
     panels[0].imshow(photograph)
     pixels, depth = camera.project(cloud.points)
-    seen = np.flatnonzero((depth > 0) & camera.inside(pixels))
-    order = seen[np.argsort(-depth[seen])]
+    visible = np.flatnonzero((depth > 0) & camera.inside(pixels))
+    order = visible[np.argsort(-depth[visible])]
     panels[1].scatter(*pixels[order].T, c=depth[order], s=0.3, linewidths=0, cmap="viridis")
     panels[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
     panels[2].imshow(_drawn(photograph // 2, camera, strands, most))

@@ -116,12 +116,15 @@ class StrandTruth:
             for p in self._capture.rig.projectors
         ]
         lit = Visibility(projectors, self.strands, self._capture.head)
-        seen = self._visibility
+        visible_from = self._visibility
         score = compare_strands(
-            strands, self.strands, samples=self._samples, visibility=lambda p: seen(p) & lit(p)
+            strands,
+            self.strands,
+            samples=self._samples,
+            visibility=lambda p: visible_from(p) & lit(p),
         )
         points = self.strands.resampled(4 * STEP).points
-        points = points[seen(points)]
+        points = points[visible_from(points)]
         return {"share": float(lit(points).mean()), **score["visible"]}
 
     def baselines(self, model: Model, spacing: float = 2e-3) -> dict[str, dict[str, Any]]:

@@ -107,11 +107,11 @@ class SerialStage:
             stack.callback(driver.close)
 
     def heard(self, name: str, reply: Callable[[str], str]) -> Callable[[str], str]:
-        def answer(line: str) -> str:
+        def respond(line: str) -> str:
             self.requests.append(f"{name} {line}")
             return reply(line)
 
-        return answer
+        return respond
 
     def strikes(self, name: str) -> Callable[[str], Fault | None]:
         return lambda line: self.faults.on_request(name, line, self.wires.pulses + 1)

@@ -83,7 +83,7 @@ def test_it_says_what_it_is(rig):
     assert can.block_wrap >= 65535
 
 
-def test_armed_it_answers_each_pulse_with_a_frame(rig):
+def test_an_armed_camera_sends_a_frame_per_pulse(rig):
     rig.camera.arm(0.002)
     frames = []
     for _ in range(4):
@@ -122,7 +122,7 @@ def test_arming_drops_what_was_not_read_and_the_numbers_go_on(rig):
     assert frame.exposure == pytest.approx(0.004, rel=0.01)
 
 
-def test_disarmed_it_answers_no_pulse(rig):
+def test_a_disarmed_camera_sends_no_frame(rig):
     rig.camera.arm(0.002)
     rig.camera.disarm()
     rig.fire()
@@ -145,7 +145,7 @@ def test_closed_it_can_be_connected_again(rig):
     assert rig.camera.read(NEVER).block_id == 1
 
 
-def test_closed_it_says_so(rig):
+def test_a_closed_camera_reports_that_it_is_closed(rig):
     rig.camera.close()
     with pytest.raises(DeviceError, match="cam_a"):
         rig.camera.arm(0.002)

@@ -34,7 +34,7 @@ class Core:
             out += self.text.raw[:length]
         return out
 
-    def ask(self, line):
+    def send(self, line):
         return self.feed(line.encode() + b"\n").decode().removesuffix("\n")
 
     def poll(self):
@@ -52,11 +52,11 @@ class Core:
         return changes
 
     def table(self, *rows):
-        self.ask(f"TABLE {len(rows)}")
+        self.send(f"TABLE {len(rows)}")
         for i, row in enumerate(rows):
-            assert self.ask(f"ROW {i} {row}") == f"OK ROW {i}"
-        assert self.ask("ARM").startswith("OK ARM")
-        assert self.ask("GO") == "OK GO"
+            assert self.send(f"ROW {i} {row}") == f"OK ROW {i}"
+        assert self.send("ARM").startswith("OK ARM")
+        assert self.send("GO") == "OK GO"
 
 
 @pytest.fixture(scope="session")
@@ -97,8 +97,8 @@ def test_a_table_is_clocked_the_same_across_the_wrap(core):
     assert [outputs for _, outputs in changes] == [outputs for _, outputs in expected]
     for (at, _), (due, _) in zip(changes, expected, strict=True):
         assert due <= at <= due + 5  # a poll for each thing that is done
-    assert core.ask("SEQ?") == "SEQ done 4 4 -"
-    assert core.ask("COUNT?") == "COUNT 4"
+    assert core.send("SEQ?") == "SEQ done 4 4 -"
+    assert core.send("COUNT?") == "COUNT 4"
 
 
 def test_lateness_does_not_add_up(core):
@@ -111,25 +111,25 @@ def test_lateness_does_not_add_up(core):
 
 
 def test_the_watchdog_stops_the_table_across_the_wrap(core):
-    assert core.ask("WATCHDOG 100") == "OK WATCHDOG 100"
+    assert core.send("WATCHDOG 100") == "OK WATCHDOG 100"
     core.table("1 L 0 10000000 0")
     core.run(99_000)
-    assert core.ask("SEQ?") == "SEQ running 0 1 -"
+    assert core.send("SEQ?") == "SEQ running 0 1 -"
     core.run(99_000)
     core.feed(b"\xff\x00noise\nPULSE 0\n")  # refused: feeds nothing
     assert core.run(2_000)[-1][1] == 0
-    assert core.ask("SEQ?") == "SEQ stopped 0 1 watchdog"
+    assert core.send("SEQ?") == "SEQ stopped 0 1 watchdog"
 
 
 def test_a_long_idle_time_is_no_lapse_of_the_watchdog(core):
     core.table("1 L 0 10 0")
     core.run(1000)
     core.now += WRAP // 2 + 12345  # 36 minutes without a request
-    assert core.ask("ARM").startswith("OK ARM 1 ")
+    assert core.send("ARM").startswith("OK ARM 1 ")
     core.now += WRAP // 2
-    assert core.ask("GO") == "OK GO"
+    assert core.send("GO") == "OK GO"
     core.run(1000)
-    assert core.ask("SEQ?") == "SEQ done 1 1 -"
+    assert core.send("SEQ?") == "SEQ done 1 1 -"
 
 
 def test_the_pattern_must_come_and_must_have_gone(core):
@@ -142,7 +142,7 @@ def test_the_pattern_must_come_and_must_have_gone(core):
     ]
     # It is still up: the gate stays closed, and the cameras do not fire into the old pattern.
     assert core.run(101_000) == []
-    assert core.ask("SEQ?") == "SEQ stopped 1 1 no-pattern"
+    assert core.send("SEQ?") == "SEQ stopped 1 1 no-pattern"
 
 
 def test_safety_inputs_close_the_gates_at_the_next_look(core):
@@ -155,12 +155,12 @@ def test_safety_inputs_close_the_gates_at_the_next_look(core):
         core.run(50)
         core.inputs = line
         assert core.poll() & (LIGHT | PROJECTOR) == 0
-        assert core.ask("SEQ?").endswith(f" {reason}")
-        assert core.ask("GO").startswith("ERR 4")
-        assert core.ask("PULSE 10").startswith("ERR 3")
+        assert core.send("SEQ?").endswith(f" {reason}")
+        assert core.send("GO").startswith("ERR 4")
+        assert core.send("PULSE 10").startswith("ERR 3")
 
 
-def test_garbage_is_answered_in_bounds_and_opens_no_gate(library):
+def test_garbage_gets_a_bounded_reply_and_opens_no_gate(library):
     rng = random.Random(7)
     core = Core(library, 0)
     words = [b"TABLE 2", b"ROW 0 1 LP 0 1 0", b"ROW 1 9 L 1 1 1", b"ARM", b"SEQ?", b"STOP"]
@@ -185,14 +185,14 @@ def test_garbage_is_answered_in_bounds_and_opens_no_gate(library):
             }
         core.now += rng.randrange(5000)
         assert core.poll() & (LIGHT | PROJECTOR) == 0
-    assert core.ask("ID?") == "HAIRSTAGE-TRIGGER 2 4096"
+    assert core.send("ID?") == "HAIRSTAGE-TRIGGER 2 4096"
 
 
 def test_garbage_while_a_table_runs_leaves_no_gate_open(library):
     rng = random.Random(11)
     for _ in range(40):
         core = Core(library, rng.randrange(WRAP))
-        core.ask("WATCHDOG 100")
+        core.send("WATCHDOG 100")
         core.table("5 LP 10 10 10", "2 L 0 1000 0")
         for _ in range(60):
             core.feed(rng.randbytes(rng.randrange(30)))

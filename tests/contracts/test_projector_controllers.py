@@ -154,7 +154,7 @@ def test_a_sequence_that_cannot_be_shown_is_refused_dark(stage, patterns, said):
 
 
 @pytest.mark.parametrize("by", ["a command", "the gate"])
-def test_lit_projectors_go_dark_when_nobody_asks(stage, by):
+def test_lit_projectors_go_dark_without_requests(stage, by):
     driver, controller = stage.projectors, stage.controller
     driver.set_watchdog(0.1)
     if by == "a command":

@@ -73,7 +73,7 @@ def test_an_echo_alone_is_no_reply(serial_stage, word):
 
 
 @pytest.mark.parametrize("make", [SerialTriggerBox, SerialProjectorController])
-def test_a_port_that_only_echoes_is_told_from_another_device(serial_stage, slack, make):
+def test_an_echoing_port_is_distinguished_from_another_device(serial_stage, slack, make):
     stage = serial_stage()
     peer = stage.peers["trigger"]
     peer._reply = lambda _line: ""
@@ -95,7 +95,7 @@ IDENTITIES = [
 
 
 @pytest.mark.parametrize(("identity", "advice"), IDENTITIES)
-def test_an_identity_that_does_not_fit_is_told_in_words(serve, slack, identity, advice):
+def test_mismatched_identity_is_reported_in_words(serve, slack, identity, advice):
     config = serve(lambda line: identity if line == "ID?" else "ERR 1 unknown")
     config = config.model_copy(update={"timeout_s": TIMEOUT_S * slack})
     driver = SerialProjectorController(config, ("left",))
@@ -108,7 +108,7 @@ def test_an_identity_that_does_not_fit_is_told_in_words(serve, slack, identity, 
     driver.close()
 
 
-def test_what_a_reply_has_to_be_is_told_without_a_pattern(serve):
+def test_expected_reply_is_reported_without_a_pattern(serve):
     config = serve(lambda line: "HAIRSTAGE-TRIGGER 2 8" if line == "ID?" else "SEQ asleep")
     driver = SerialTriggerBox(config)
     driver.connect()

@@ -124,7 +124,7 @@ def test_exposures_out_of_range_fire_nothing(any_box, exposure):
     assert any_box.driver.count() == 0
 
 
-def test_a_box_without_a_table_says_so(serve):
+def test_a_box_without_a_table_reports_it(serve):
     driver = First(serve).driver
     assert driver.table_rows == 0
     with pytest.raises(
@@ -230,7 +230,7 @@ def test_a_running_table_is_not_disturbed(box):
     box.driver.stop()
 
 
-def test_the_table_stops_when_nobody_asks(box, slack):
+def test_the_table_stops_without_requests(box, slack):
     running(box, LONG, watchdog_s=0.1 * slack)
     until(lambda: closed(box))
     assert box.driver.progress() == TableProgress("stopped", 0, 1, "watchdog")
@@ -346,12 +346,12 @@ def test_bad_requests_are_refused_in_one_line(box, line, code):
     ],
 )
 def test_bad_rows_are_refused_and_the_table_can_go_on(box, row, code):
-    ask = box.driver._lines.request
-    ask("TABLE 1", "OK TABLE 1", "beginning")
+    send_line = box.driver._lines.request
+    send_line("TABLE 1", "OK TABLE 1", "beginning")
     with pytest.raises(DeviceError, match=f"'ERR {code} "):
-        ask(row, "OK", "trying")
+        send_line(row, "OK", "trying")
     with pytest.raises(DeviceError, match="'ERR 4 "):
-        ask("ARM", "OK", "trying")
-    ask("ROW 0 007 L 0 1 0", "OK ROW 0", "going on")
+        send_line("ARM", "OK", "trying")
+    send_line("ROW 0 007 L 0 1 0", "OK ROW 0", "going on")
     # The checksum is of the row as the box holds it.
-    ask("ARM", "OK ARM 7 d029b3ca", "arming")
+    send_line("ARM", "OK ARM 7 d029b3ca", "arming")

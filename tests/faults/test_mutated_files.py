@@ -33,17 +33,17 @@ def mutated(formats: list[str], count: int, folder: Path) -> dict[str, Any]:
         )
         lines = [json.loads(x) for x in done.stdout.splitlines() if x.startswith('{"')]
         # What ended the process leaves the number of its file last.
-        assert "told" in lines[-1], (name, done.returncode, lines[-1], done.stderr[-500:])
+        assert "outcomes" in lines[-1], (name, done.returncode, lines[-1], done.stderr[-500:])
         assert [x for x in lines if "wrong" in x] == [], name
-        assert sum(lines[-1]["told"].values()) == count
+        assert sum(lines[-1]["outcomes"].values()) == count
         assert lines[-1]["peak_bytes"] < MOST_BYTES, name
         result[name] = lines[-1]
     return result
 
 
 def test_some_damaged_files(tmp_path):
-    told = mutated(["journal", "frame"], 25, tmp_path)
-    assert told["journal"]["told"]["refused"] > 0
+    outcome = mutated(["journal", "frame"], 25, tmp_path)
+    assert outcome["journal"]["outcomes"]["refused"] > 0
 
 
 @pytest.mark.slow

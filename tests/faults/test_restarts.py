@@ -50,8 +50,8 @@ def test_lease_and_queue_outlast_a_restart(ended_by, simulated, serve):
 def release(http: httpx.Client, headers: dict[str, str] | None = None) -> None:
     """Release the queue as somebody who has read why it is held."""
     hold = http.get("/queue").json()["hold"]["id"]
-    answer = http.post("/queue:go-on", json={"hold": hold}, headers=headers)
-    assert answer.status_code == 200, answer.text
+    response = http.post("/queue:go-on", json={"hold": hold}, headers=headers)
+    assert response.status_code == 200, response.text
 
 
 def count_lamps(world) -> list[int]:

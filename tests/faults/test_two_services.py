@@ -90,7 +90,7 @@ def test_machines_whose_names_begin_alike_are_not_one(simulated, begin, elsewher
         begin(other_serial_ports(rig_file), "two")
 
 
-def test_a_dead_machine_has_the_stage_until_somebody_says_so(simulated, begin, elsewhere):
+def test_a_dead_machine_keeps_the_stage_until_a_person_releases_it(simulated, begin, elsewhere):
     rig_file, _ = simulated()
     elsewhere("left")
     dead = begin(rig_file, "one")
@@ -121,7 +121,7 @@ def test_what_a_killed_service_has_left_is_taken(simulated, begin, tmp_path):
     begin(rig_file, "other")
 
 
-def test_a_bank_that_was_switched_off_is_asked_again(simulated, begin):
+def test_a_bank_that_was_switched_off_is_queried_again(simulated, begin):
     rig_file, world = simulated()
     first = begin(rig_file, "one")
     world.lamps.own(0, [0])

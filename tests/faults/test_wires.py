@@ -295,5 +295,5 @@ def check_frames(capture: Capture) -> None:
             level = 0.2 * (step.row + 1) + pose
         for camera in ("cam_a", "cam_b"):
             if level is not None and capture.has(step, camera):
-                seen = capture.frame(step, camera).mean()
-                assert seen == pytest.approx(level, abs=0.045), (step, camera)
+                brightness = capture.frame(step, camera).mean()
+                assert brightness == pytest.approx(level, abs=0.045), (step, camera)

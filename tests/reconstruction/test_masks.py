@@ -122,7 +122,7 @@ def test_the_noise_of_frames_that_hair_fills_is_that_of_the_dark_ones() -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 40])
-def test_the_background_of_frames_whose_black_was_clipped_is_told(frames: int) -> None:
+def test_the_background_of_frames_with_clipped_black_is_found(frames: int) -> None:
     """Sums of frames that have lost what was below zero; 60 % is background, the subject dim."""
     rng, sigma = np.random.default_rng(0), 0.01
     subject = np.zeros((100, 100), bool)
@@ -258,7 +258,7 @@ def crown(cameras: tuple[Camera, ...], names: tuple[str, ...]) -> PointCloud:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
-def test_flat_hair_on_a_head_is_told_at_any_noise(
+def test_flat_hair_on_a_head_is_found_at_any_noise(
     shoot: Callable[..., Capture], noise: float
 ) -> None:
     """Grey fibres on grey skin; a third of the hair has points, the rest lies on the head."""
@@ -325,7 +325,7 @@ def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
     assert masks["right"].source == "geometry alone"
 
 
-def test_a_head_without_lights_or_points_does_not_tell_hair_from_skin(
+def test_a_head_without_lights_or_points_does_not_separate_hair_from_skin(
     shoot: Callable[..., Capture],
 ) -> None:
     """A head a pixel inside the outline: what is beyond it is hair, and all within follows."""
@@ -396,7 +396,7 @@ def looks_of(gloss: float, colour: float, count: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("colour", [0.4, 0.0])
-def test_hair_that_lies_flat_is_told_by_colour_and_without_it_by_gloss(colour: float) -> None:
+def test_flat_hair_is_found_by_colour_and_without_it_by_gloss(colour: float) -> None:
     sure, flat = looks_of(0.25, colour, 500, 0), looks_of(0.25, colour, 300, 1)
     skin = looks_of(0.04, 0.0, 600, 2)
     known = np.arange(1400) < 500
@@ -415,7 +415,7 @@ def test_flat_hair_that_is_partly_matte_does_not_blur_the_colours() -> None:
     assert (odds(skin.T) < 0).mean() > 0.99
 
 
-def test_where_one_class_is_seen_it_is_not_split() -> None:
+def test_a_single_class_is_not_split() -> None:
     known = np.arange(1000) < 500
     covered = looks_of(0.25, 0.0, 1000, 0)
     assert (two_classes(covered, known).scores(covered.T) > 0).all()

@@ -97,21 +97,23 @@ def unswept(shoot: Callable[..., Capture], around: list[Camera]) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[str, float]]:
+def progress_calls() -> list[tuple[str, float]]:
     """What the progress of `model` said."""
     return []
 
 
 @pytest.fixture(scope="module")
 def model(
-    unswept: Capture, tmp_path_factory: pytest.TempPathFactory, told: list[tuple[str, float]]
+    unswept: Capture,
+    tmp_path_factory: pytest.TempPathFactory,
+    progress_calls: list[tuple[str, float]],
 ) -> tuple[Path, Report]:
     folder = tmp_path_factory.mktemp("model")
 
-    def tell(what: str, share: float) -> None:
-        told.append((what, share))
+    def record_progress(what: str, share: float) -> None:
+        progress_calls.append((what, share))
 
-    return folder, reconstruct(unswept, Model(folder), options=QUICK, progress=tell)
+    return folder, reconstruct(unswept, Model(folder), options=QUICK, progress=record_progress)
 
 
 def test_every_file_is_written(model: tuple[Path, Report], around: list[Camera]) -> None:
@@ -147,14 +149,14 @@ def runs_down(strands: Strands, within_deg: float = 7, mostly: float = 0.8) -> N
 
 
 def test_the_progress_of_all_stages_goes_from_nothing_to_all_once(
-    model: tuple[Path, Report], told: list[tuple[str, float]]
+    model: tuple[Path, Report], progress_calls: list[tuple[str, float]]
 ) -> None:
-    shares = [share for _, share in told]
+    shares = [share for _, share in progress_calls]
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0, 1)
     names = [s.name for s in model[1].stages]
-    assert [what for what, _ in told if what in names] == names
-    begun = dict(reversed(told))  # where each was told of first
+    assert [what for what, _ in progress_calls if what in names] == names
+    begun = dict(reversed(progress_calls))  # where each was told of first
     assert 0.1 < begun["orientation"] < begun["strands"] < begun["refinement"] < 0.9
 
 
@@ -171,23 +173,25 @@ def test_half_as_many_pixels_a_side_give_nearly_the_same(unswept: Capture, tmp_p
     assert image.shape == (96, 96)  # masks are left in the pixels of the frames
 
 
-def test_an_estimate_tells_of_the_stages_that_take_time(
+def test_an_estimate_reports_the_stages_that_take_time(
     unswept: Capture, model: tuple[Path, Report]
 ) -> None:
-    told = estimate(unswept, method="light_planes", options=QUICK)
+    estimated = estimate(unswept, method="light_planes", options=QUICK)
     few = unswept.view(cameras=["c0", "c72"], lights=unswept.olat_lights()[:9])
     assert estimate(few, options=QUICK).frames == 2 * len(few.steps)
-    assert [s.name for s in told.stages] == [s.name for s in model[1].stages]
-    assert told.frames == sum(
+    assert [s.name for s in estimated.stages] == [s.name for s in model[1].stages]
+    assert estimated.frames == sum(
         unswept.has(s, c.name) for s in unswept.steps for c in unswept.rig.cameras
     )
-    assert all(s.seconds >= 0 and 0 <= s.measured <= 1 and s.peak_gb > 0.1 for s in told.stages)
+    assert all(
+        s.seconds >= 0 and 0 <= s.measured <= 1 and s.peak_gb > 0.1 for s in estimated.stages
+    )
 
 
 def test_more_of_everything_is_estimated_to_take_more(unswept: Capture) -> None:
-    def cost(capture: Capture, **asked: Any) -> tuple[float, float]:
-        told = {s.name: s for s in estimate(capture, **asked).stages}
-        return told["orientation"].peak_gb, told["strands"].peak_gb
+    def cost(capture: Capture, **cost_options: Any) -> tuple[float, float]:
+        estimated = {s.name: s for s in estimate(capture, **cost_options).stages}
+        return estimated["orientation"].peak_gb, estimated["strands"].peak_gb
 
     whole = cost(unswept)
     assert all(np.array(whole) > cost(unswept.view(reduced=3)))
@@ -206,8 +210,8 @@ def test_lenses_that_bend_lines_give_the_same_strands(
     write_obj(capture.path / "head.obj", ball(HEAD))
     report = reconstruct(capture, Model(tmp_path), options=QUICK)
     assert set(report["lenses"].figures["pixels_kept"]) == {c.name for c in around}
-    told = estimate(capture, method="light_planes", options=QUICK)
-    assert [s.name for s in told.stages] == [s.name for s in report.stages]
+    estimated = estimate(capture, method="light_planes", options=QUICK)
+    assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     runs_down(read_strands(tmp_path / "strands.npz"))
     litres = [r["envelope"].figures["envelope_litres"] for r in (report, model[1])]
     assert litres[0] == pytest.approx(litres[1], rel=0.06)
@@ -247,9 +251,9 @@ def test_auto_without_head_or_sweep_fills_the_hull_along_what_is_measured(
         "method": "hull",
         "capture_holds": "no sweep, 4 single lights, no head",
     }
-    told = estimate(capture, options=COARSE)
-    assert told.method == "hull"
-    assert [s.name for s in told.stages] == [s.name for s in report.stages]
+    estimated = estimate(capture, options=COARSE)
+    assert estimated.method == "hull"
+    assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     assert any("no head" in w for w in report["envelope"].warnings)
     strands = read_strands(tmp_path / "strands.npz")
     assert len(strands) > 100
@@ -271,8 +275,8 @@ def test_auto_with_a_head_and_with_nothing_but_masks(unswept: Capture, tmp_path:
     dark.steps = tuple(s for s in dark.steps if s.kind != "olat")
     report = reconstruct(dark, Model(tmp_path / "dark"), method="auto", options=QUICK)
     assert any("all strands are guessed" in w for w in report["line stereo"].warnings)
-    told = estimate(dark, options=QUICK)
-    assert [s.name for s in told.stages] == [s.name for s in report.stages]
+    estimated = estimate(dark, options=QUICK)
+    assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     runs_down(read_strands(tmp_path / "dark" / "strands.npz"))
 
 
@@ -294,8 +298,8 @@ def test_a_sweep_is_triangulated(
     capture = shoot(cameras=cameras, lights=LIGHTS, extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
     report = reconstruct(capture, Model(tmp_path), options=QUICK)
-    told = estimate(capture, method="light_planes", options=QUICK)
-    assert [s.name for s in told.stages] == [s.name for s in report.stages]
+    estimated = estimate(capture, method="light_planes", options=QUICK)
+    assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     assert not report["triangulation"].left_out
     assert report["motion"].seconds > 0
     points = PointCloud.load(tmp_path / "points.npz").points
@@ -314,9 +318,9 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     write_obj(capture.path / "scalp.obj", Mesh(upper, np.zeros((0, 3))))
     write_obj(tmp_path / "larger.obj", ball(1.08 * HEAD))
     options = replace(COARSE, head_mesh=str(tmp_path / "larger.obj"))
-    told = estimate(capture, method="light_planes", options=options)
+    estimated = estimate(capture, method="light_planes", options=options)
     report = reconstruct(capture, Model(tmp_path / "model"), options=options)
-    assert [s.name for s in told.stages] == [s.name for s in report.stages]
+    assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     assert report["head"].figures["used_share"] > 0.9
     assert report["head"].figures["rms_mm"] < 0.5
     assert any("assumed to face" in w for w in report["head"].warnings)
@@ -336,7 +340,7 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     assert not (tmp_path / "model" / "head.obj").exists()
 
 
-def test_no_sweep_is_said(
+def test_a_missing_sweep_gives_a_warning(
     shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
 ) -> None:
     capture = shoot(cameras=around[:3], sweep=False, lights=LIGHTS[:4], extra=hair)
@@ -422,17 +426,17 @@ def test_line_stereo_alone_is_no_longer_than_the_hair_either(
     assert strands.roots[0] == pytest.approx([0, -0.1, 0.1])
 
 
-def test_what_was_seen_is_not_covered_by_roots(
+def test_observed_strands_are_not_covered_by_roots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A column of hair on the scalp's top: seen strands fill it, and no root has one."""
     grid = VoxelGrid(np.array([-4e-3, -4e-3, HEAD]), 4e-3, np.ones((3, 3, 10), bool))
     upright = np.tile([0, 0, 1.0], (90, 1))
     field, _ = solve_field(grid, grid.centers(), upright)
-    seen = [p.astype(np.float32) for p in grid.centers().reshape(9, 10, 3)]
+    observed = [p.astype(np.float32) for p in grid.centers().reshape(9, 10, 3)]
     monkeypatch.setattr("reconstruction.growing.grow_from_roots", lambda *_, **__: [])
     stages = GrowingStages(Model(tmp_path), QUICK, silent, Report())
-    stages.grown(field, find_scalp(ball(HEAD)), list(seen))
+    stages.grown(field, find_scalp(ball(HEAD)), list(observed))
     figures = stages.report["strands"].figures
     assert figures["covered"] == 1
     assert figures["covered_by_roots"] == 0

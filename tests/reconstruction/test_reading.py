@@ -64,5 +64,5 @@ def test_an_obj_whose_faces_point_nowhere_is_refused(face, tmp_path):
         read_obj(tmp_path / "head.obj")
 
 
-def test_a_name_that_is_not_utf_8_can_be_told():
+def test_a_name_that_is_not_utf_8_can_be_printed():
     assert printable("caf\udce9 ü") == r"caf\udce9 ü"

@@ -55,16 +55,16 @@ def test_a_stage_that_fails_is_timed_too() -> None:
 
 
 def test_a_stage_that_was_not_expected_or_does_not_come_takes_no_progress_back() -> None:
-    told: list[float] = []
+    shares: list[float] = []
     report = ReportWithProgress(
-        lambda _, share: told.append(share), ["masks", "depth", "field", "roots"]
+        lambda _, share: shares.append(share), ["masks", "depth", "field", "roots"]
     )
     for name in ("masks", "lightcodes", "field", "roots"):
         with report.stage(name):
             for share in (0.5, 0.2, 1.0):
                 report.progress("doing it", share)
-    assert told == sorted(told)
-    ends = told[3::4]
+    assert shares == sorted(shares)
+    ends = shares[3::4]
     assert all(np.diff([0, *ends]) > 0)
     assert ends[-1] == 1
 

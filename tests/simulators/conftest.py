@@ -74,7 +74,7 @@ class SerialClient:
     def __init__(self, port: str) -> None:
         self.port = serial.Serial(port, timeout=0.5 * machine_slack())
 
-    def ask(self, line: str) -> str:
+    def send(self, line: str) -> str:
         self.port.write(line.encode() + b"\n")
         return self.port.readline().decode("ascii", "replace").removesuffix("\n")
 
@@ -85,22 +85,22 @@ class CameraClient:
     def __init__(self, host: str, port: int) -> None:
         self.socket = socket.create_connection((host, port), timeout=60)
 
-    def ask(self, **request: Any) -> dict[str, Any]:
+    def send(self, **request: Any) -> dict[str, Any]:
         return self.raw(json.dumps(request).encode())
 
     def raw(self, body: bytes) -> dict[str, Any]:
         self.socket.sendall(struct.pack(">I", len(body)) + body)
         (length,) = struct.unpack(">I", self._exactly(4))
-        answer: dict[str, Any] = json.loads(self._exactly(length))
-        if "bytes" in answer:
-            answer["payload"] = self._exactly(answer["bytes"])
-        return answer
+        reply: dict[str, Any] = json.loads(self._exactly(length))
+        if "bytes" in reply:
+            reply["payload"] = self._exactly(reply["bytes"])
+        return reply
 
     def read(self) -> dict[str, Any]:
         """The next answer to `read` that is not busy."""
-        while (answer := self.ask(op="read")).get("status") == "busy":
+        while (reply := self.send(op="read")).get("status") == "busy":
             pass
-        return answer
+        return reply
 
     def frame(self) -> np.ndarray:
         return np.frombuffer(self.read()["payload"], "<u2").reshape(16, 16, 3)
@@ -129,7 +129,7 @@ class Bench:
     def camera(self, name: str) -> CameraClient:
         client = CameraClient(self.wires["cameras"]["host"], self.wires["cameras"]["port"])
         self.sockets.append(client)
-        assert client.ask(op="hello", camera=name)["ok"]
+        assert client.send(op="hello", camera=name)["ok"]
         return client
 
     def select(self, command: int) -> None:

@@ -77,7 +77,7 @@ def test_wrong_arguments_end_it_with_code_2(rig_file, capsys, arguments, said):
     assert said in capsys.readouterr().err
 
 
-def test_a_variant_that_cannot_run_is_told_before_any_capture(
+def test_an_unknown_variant_is_reported_before_devices_are_ready(
     rig_file, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setenv("HAIRSTAGE_VARIANT", "nonsense")

@@ -135,7 +135,7 @@ def test_responses_are_rendered_once_and_old_poses_go(frames):
     ]
 
 
-def test_drift_reaches_what_was_asked_and_starts_at_rest():
+def test_drift_starts_at_rest_and_reaches_the_requested_value():
     drift = Drift(18, 1.5e-3, 4)
     rotation, translation = drift.pose(0)
     assert np.array_equal(rotation, np.eye(3))
@@ -159,7 +159,7 @@ def test_shot_noise_grows_as_the_full_well_says():
     assert counts.var() == pytest.approx(variance, rel=0.02)
 
 
-def test_light_that_is_not_a_number_is_said_where():
+def test_non_finite_light_is_reported_with_its_place():
     radiance = np.ones((4, 5, 3))
     radiance[2, 3, 1] = np.nan
     with pytest.raises(ValueError, match=r"not a number at \(row, column, channel\) \[2, 3, 1\]"):

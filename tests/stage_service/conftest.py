@@ -118,10 +118,10 @@ class Lights(socketserver.BaseRequestHandler):
             with world.lock:
                 if self.server.dead:  # type: ignore[attr-defined]
                     return
-                answer = self.answer(world, pdu)
-            self.request.sendall(struct.pack(">HHHB", tid, 0, len(answer) + 1, unit) + answer)
+                reply = self.respond(world, pdu)
+            self.request.sendall(struct.pack(">HHHB", tid, 0, len(reply) + 1, unit) + reply)
 
-    def answer(self, world: World, pdu: bytes) -> bytes:
+    def respond(self, world: World, pdu: bytes) -> bytes:
         function, address, value = struct.unpack(">BHH", pdu[:5])
         if function == 4:
             bits = 2 * world.interlock | 4 * world.estop | 8 * bool(world.lit)
@@ -174,11 +174,11 @@ class Cameras(socketserver.BaseRequestHandler):
             if request["op"] == "read" and name in world.mute:
                 continue
             with world.lock:
-                answer, payload = self.answer(world, name, request)
-            data = json.dumps(answer).encode()
+                reply, payload = self.respond(world, name, request)
+            data = json.dumps(reply).encode()
             self.request.sendall(struct.pack(">I", len(data)) + data + payload)
 
-    def answer(
+    def respond(
         self, world: World, name: str, request: dict[str, Any]
     ) -> tuple[dict[str, Any], bytes]:
         op = request["op"]
@@ -242,11 +242,11 @@ def projectors(world: World, line: str) -> str:
 class SerialPeer:
     """Answers lines on a pseudo-terminal; keeps the far end open, as a cable does."""
 
-    def __init__(self, world: World, answer: Any) -> None:
+    def __init__(self, world: World, respond: Any) -> None:
         self.master, self.far = pty.openpty()
         tty.setraw(self.far)
         self.path = os.ttyname(self.far)
-        self.world, self.answer = world, answer
+        self.world, self.respond = world, respond
         self.wake, self.waker = os.pipe()
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
@@ -270,7 +270,7 @@ class SerialPeer:
                 text = line.decode()
                 with self.world.lock:
                     self.world.requests.append(text)
-                    reply = self.answer(self.world, text).encode() + b"\n"
+                    reply = self.respond(self.world, text).encode() + b"\n"
                     if text in self.world.late:
                         self.world.late.remove(text)
                         held += reply
@@ -372,7 +372,7 @@ def wire(tmp_path: Path, slack: int) -> Callable[..., Wires]:
 
     def made(world: World, **timeouts: float) -> Wires:
         servers = [Server(world, handler) for handler in (Lights, Cameras)]
-        serial = [SerialPeer(world, answer) for answer in (trigger, projectors)]
+        serial = [SerialPeer(world, respond) for respond in (trigger, projectors)]
         path = tmp_path / f"rig{next(numbers) or ''}.toml"
         ports, paths = [s.server_address[1] for s in servers], [s.path for s in serial]
         path.write_text(RIG + devices(ports, paths, slack, **timeouts))

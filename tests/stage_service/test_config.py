@@ -49,7 +49,7 @@ def test_every_shipped_rig_loads(path):
     assert sorted(beside) == sorted(c.name for c in rig_file.rig.cameras)
 
 
-def test_a_light_bank_of_no_lamps_is_refused_before_it_is_asked(tmp_path):
+def test_a_light_bank_without_lamps_is_refused_before_it_is_queried(tmp_path):
     (path := tmp_path / "rig.toml").write_text(SMALL)
     with pytest.raises(RigError, match=r"rig.toml: no lights"):
         DeviceSet.of(load_rig_file(path))
@@ -65,8 +65,8 @@ def test_devices_that_cannot_be_are_refused_once_and_leave_the_root_to_others(tm
         text.replace('kind = "modbus_tcp"', 'kind = "modbus_tcp"\nregisters = {levels = 900}')
     )
     assert main(["rig", "check", str(bad)]) == 3
-    told = f"{bad}: devices.lights.registers: selector overlaps levels at 1000"
-    assert told in capsys.readouterr().err
+    message = f"{bad}: devices.lights.registers: selector overlaps levels at 1000"
+    assert message in capsys.readouterr().err
     with pytest.raises(RigError, match="selector overlaps levels"):
         CaptureManager(load_rig_file(bad), tmp_path / "root")
     RootLock(tmp_path / "root").release()
@@ -174,18 +174,18 @@ def test_a_rig_without_a_projector_controller_may_call_its_projectors_as_it_like
 
 
 @pytest.mark.parametrize(
-    ("serials", "told"),
+    ("serials", "message"),
     [
         ('other = "1"', "serials: the serial number of the camera 'cam_00' is missing"),
         ('cam_00 = "1"\nother = "2"', "serials.other: the rig has no camera 'other'"),
         ('cam_00 = "0815 0000"', r"serials.cam_00: expected the letters.* got '0815 0000'"),
     ],
 )
-def test_serial_numbers_are_those_of_the_rig_s_cameras(tmp_path, serials, told):
+def test_serial_numbers_are_those_of_the_rig_s_cameras(tmp_path, serials, message):
     cameras = '[devices.cameras]\nkind = "basler"\ngain = 1.0\n[devices.cameras.serials]\n'
     text = SMALL.replace(
         "[devices.cameras]\nport = 15021\nbusy_s = 900.0\n", cameras + serials + "\n"
     )
     (path := tmp_path / "rig.toml").write_text(text)
-    with pytest.raises(RigError, match=told):
+    with pytest.raises(RigError, match=message):
         load_rig_file(path)

@@ -55,7 +55,7 @@ def test_a_cause_that_comes_and_goes_is_no_more_lines_than_one_that_lasts(causes
     assert len(lines()) <= 2 * 600 / EVERY_S + 2
 
 
-def test_a_second_run_after_more_than_a_minute_is_told_anew(causes, now, lines):
+def test_a_second_run_after_more_than_a_minute_is_logged_again(causes, now, lines):
     for start in (1000.0, 5000.0):
         now[0] = start
         causes.failed(log, "the disk", "no space left")

@@ -160,7 +160,7 @@ def test_an_error_of_a_logarithm_is_a_share(model):
     assert "± 2.0%, unknown, ± 10.0%" in text
 
 
-def test_what_is_rendered_and_what_is_not_is_said_of_each_fit_by_itself(model):
+def test_rendered_and_missing_fits_are_listed_separately(model):
     report = model.report()
     with report.stage("inverse_rendering"):
         pass

@@ -18,7 +18,7 @@ def test_a_plan_is_costed_by_public_names_alone():
     assert not hasattr(stage_service, "Stage")
 
 
-def test_the_package_loads_nothing_before_a_name_is_asked_for():
+def test_the_package_loads_modules_on_first_use_of_a_name():
     code = (
         "import sys, stage_service; print([m for m in ('pydantic', 'numpy') if m in sys.modules])"
     )

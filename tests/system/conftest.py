@@ -170,8 +170,8 @@ class TinyStage:
         lights = tomllib.loads(self.devices.read_text())["devices"]["lights"]
         with socket.create_connection(("127.0.0.1", lights["port"]), timeout=60) as bank:
             bank.sendall(struct.pack(">HHHBBHH", 7, 0, 6, 1, 4, 1, 1))
-            answer = bank.recv(11, socket.MSG_WAITALL)
-        lit: int = struct.unpack(">HHHBBBH", answer)[-1]
+            reply = bank.recv(11, socket.MSG_WAITALL)
+        lit: int = struct.unpack(">HHHBBBH", reply)[-1]
         return lit
 
     def verify(self, capture: Path) -> list[str]:

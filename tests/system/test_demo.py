@@ -94,9 +94,9 @@ def interrupt(stage, out: Path, when: Callable[[], bool]) -> None:
         try:
             stage.until(lambda: begun.poll() is not None or when())
             begun.send_signal(signal.SIGINT)
-            answer, _ = begun.communicate(timeout=300)
+            output, _ = begun.communicate(timeout=300)
         finally:
             begun.kill()
-    assert begun.returncode == 130, answer
-    assert json.loads(answer)["error"]["type"] == "Interrupted"
+    assert begun.returncode == 130, output
+    assert json.loads(output)["error"]["type"] == "Interrupted"
     assert processes_of(out) == []

@@ -19,13 +19,13 @@ def test_longitudinal_lobes_integrate_to_one(beta_m, tilt_deg):
     number, each = dr.llvm.ad.Float64, lambda x: dr.opaque(dr.llvm.ad.Float64, x)
     for theta in THETAS:
         for p in range(4):
-            seen = float(reference.tilted(p, theta, np.radians(tilt_deg)))
+            theta_p = float(reference.tilted(p, theta, np.radians(tilt_deg)))
             v = float(reference.variance(p, beta_m))
-            nodes, weights = panels([-seen], [np.sqrt(v)], -np.pi / 2, np.pi / 2)
+            nodes, weights = panels([-theta_p], [np.sqrt(v)], -np.pi / 2, np.pi / 2)
             weights = weights * np.cos(nodes)
-            assert reference.m_p(seen, nodes, v) @ weights == pytest.approx(1, abs=1e-6)
+            assert reference.m_p(theta_p, nodes, v) @ weights == pytest.approx(1, abs=1e-6)
             ours = lobes.m_p(
-                *(each(np.sin(seen)), each(np.cos(seen))),
+                *(each(np.sin(theta_p)), each(np.cos(theta_p))),
                 *(number(np.sin(nodes)), number(np.cos(nodes)), each(v)),
             )
             assert np.array(ours) @ weights == pytest.approx(1, abs=1e-6)

@@ -54,15 +54,15 @@ def probabilities(case, p, along, around):
     """Probability of lobe `p` in each cell between the edges `along`, `around` (in radians)."""
     theta, gamma = reference.inclination(case.wi), reference.azimuth(case.wi)
     inner = reference.refracted_azimuth(theta, gamma, case.eta)
-    seen = float(reference.tilted(p, theta, case.optics["tilt"]))
+    theta_p = float(reference.tilted(p, theta, case.optics["tilt"]))
     v, s = reference.variance(p, case.beta_m), float(reference.logistic_scale(case.beta_n))
     middle = float(gamma + reference.phi(p, gamma, inner)) % (2 * np.pi)
     middles = [middle + np.pi * k for k in range(-3, 3)]
 
     def rows():
         for low, high in pairwise(along):
-            nodes, weights = panels([-seen], [float(np.sqrt(v))], low, high)
-            yield reference.m_p(seen, nodes, v) @ (weights * np.cos(nodes))
+            nodes, weights = panels([-theta_p], [float(np.sqrt(v))], low, high)
+            yield reference.m_p(theta_p, nodes, v) @ (weights * np.cos(nodes))
 
     def columns():
         for low, high in pairwise(around):

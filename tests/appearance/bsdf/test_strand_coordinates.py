@@ -79,9 +79,9 @@ def test_the_nearest_place_on_a_segment_and_its_tangent():
     v = rng.uniform(0, 1, (n, 1))
     w = 1 - v
     basis = np.hstack([w**3, 3 * v**3 - 6 * v**2 + 4, 3 * w**3 - 6 * w**2 + 4, v**3]) / 6
-    slope = np.hstack([-(w**2), 3 * v**2 - 4 * v, 1 + 2 * v - 3 * v**2, v**2]) / 2
+    derivative = np.hstack([-(w**2), 3 * v**2 - 4 * v, 1 + 2 * v - 3 * v**2, v**2]) / 2
     point = np.einsum("nk,nkc->nc", basis, control)
-    tangent = np.einsum("nk,nkc->nc", slope, control)
+    tangent = np.einsum("nk,nkc->nc", derivative, control)
     aside = np.cross(tangent, rng.normal(size=(n, 3)))
     surface = point + 0.004 * aside / np.linalg.norm(aside, axis=-1, keepdims=True)
     padded = np.concatenate([control, np.full((n, 4, 1), 0.004)], -1).astype(np.float32)

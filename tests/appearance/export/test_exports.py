@@ -255,11 +255,13 @@ def test_stock_mitsuba_renders_our_picture(which, request, tmp_path):
         np.array(render_environment(model.scene(), camera, light, Sampling(256, 16, seed)))
         for seed in (1, 2)
     ]
-    seen = ours[0].sum(axis=-1) > 0
+    covered = ours[0].sum(axis=-1) > 0
     mean = 0.5 * (ours[0] + ours[1])
-    np.testing.assert_allclose(stock[seen].mean(axis=0), mean[seen].mean(axis=0), rtol=0.03)
-    noise = np.sqrt(((ours[0] - ours[1])[seen] ** 2).mean())
-    assert np.sqrt(((stock - mean)[seen] ** 2).mean()) < 1.5 * noise + 0.02 * mean[seen].mean()
+    np.testing.assert_allclose(stock[covered].mean(axis=0), mean[covered].mean(axis=0), rtol=0.03)
+    noise = np.sqrt(((ours[0] - ours[1])[covered] ** 2).mean())
+    assert (
+        np.sqrt(((stock - mean)[covered] ** 2).mean()) < 1.5 * noise + 0.02 * mean[covered].mean()
+    )
 
 
 def test_mitsubas_camera_sees_a_point_where_ours_does(fitted, tmp_path):
@@ -360,7 +362,7 @@ def test_blender_finds_every_root_in_one_face_of_the_head(fitted, tmp_path):
         assert ((side > 1e-9).all(axis=1) | (side < -1e-9).all(axis=1)).sum() == 1
 
 
-def test_blender_is_not_asked_to_add_no_curves(fitted, tmp_path, monkeypatch):
+def test_blender_script_without_strands_adds_no_curves(fitted, tmp_path, monkeypatch):
     """`add_curves([])` ends Blender 4.5 by a segmentation fault."""
     bpy = MagicMock()
     added = bpy.data.hair_curves.new.return_value.add_curves

@@ -106,7 +106,7 @@ def system_of(planted, views, ridge, degree=1):
     options = replace(EXACT, degree=degree)
     grids = [Grid.of(level, len(planted.strands)) for level in LEVELS]
     samples = [v.samples(options, planted.scale) for v in views]
-    seen = [
+    observed = [
         ViewSystem(
             ViewBasis.of(v.hits, grids[-1], planted.places, degree, in_strands=True),
             [Gram.of(s, degree)],
@@ -114,7 +114,7 @@ def system_of(planted, views, ridge, degree=1):
         for v, s in zip(views, samples, strict=True)
     ]
     return LeastSquares(
-        seen, nested(grids, planted.places), Form("modulation", degree), ridge
+        observed, nested(grids, planted.places), Form("modulation", degree), ridge
     ), samples
 
 
@@ -138,7 +138,7 @@ def test_folds_solved_at_once_are_what_they_are_one_by_one(planted):
         [tuple(f for f in range(6) if folds.group(f, v, part) is None) for part in (0, 1)]
         for v in range(len(views))
     ]
-    bases = [seen.basis for seen in system.views]
+    bases = [observed.basis for observed in system.views]
     block = [ViewSystem(*each) for each in zip(bases, parts, fits, strict=True)]
     at_once = conjugate_gradients(replace(system, views=block, fits=6), 200, 1e-4)
     for fold in range(6):
@@ -169,7 +169,7 @@ def test_anchors_that_no_camera_sees_are_zero(planted):
     views = planted.views(planted.truth())
     options = replace(ROUGH, levels=((4, 6, 6),), ridges=(1e-3,))
     found = fitted(planted, views, options)
-    seen = set()
+    observed = set()
     for view in views:
         strand = view.hits.column("strand")
         on = strand >= 0
@@ -177,9 +177,9 @@ def test_anchors_that_no_camera_sees_are_zero(planted):
         low, high, share = grid.near(
             strand[on].astype(int), view.hits.column("along")[on], planted.places
         )
-        seen |= set(low[share < 1]) | set(high[share > 0])
-    assert set(found.field.rows) <= seen
-    assert len(seen) < 4 * 36, "some cells have no strand in sight"
+        observed |= set(low[share < 1]) | set(high[share > 0])
+    assert set(found.field.rows) <= observed
+    assert len(observed) < 4 * 36, "some cells have no strand in sight"
 
 
 def test_odd_data_give_a_field_or_a_sentence(planted):
@@ -311,7 +311,7 @@ def test_saturated_pixels_weigh_nothing(planted):
     assert found.validation["both new"]["with"] > found.validation["both new"]["without"] + 6
 
 
-def test_frames_that_no_factor_explains_are_told(planted):
+def test_frames_that_no_factor_explains_give_a_warning(planted):
     """Black frames under half of the lights: a smooth factor undershoots there."""
     views = planted.views(planted.truth())
     x = np.array([light.position[0] for light in views[0].lights])
@@ -323,7 +323,7 @@ def test_frames_that_no_factor_explains_are_told(planted):
     assert found.validation["new lights"]["with"] > found.validation["new lights"]["without"]
 
 
-def test_a_fit_that_was_killed_goes_on_behind_the_ridges_it_had_done(planted, tmp_path):
+def test_killed_fit_resumes_after_its_finished_ridges(planted, tmp_path):
     views = planted.views(planted.truth())
 
     def killed(what, share):
@@ -389,8 +389,8 @@ def test_a_checkpoint_is_on_the_disk_before_it_replaces_the_one_before_it(
             fitted(planted, views, options, Monitor(checkpoint=folder / "field.npz"))
     assert [f.name for f in folder.iterdir()] == ["field.npz"]
     again = []
-    told = Monitor(lambda w, s: again.append(w), folder / "field.npz")
-    fitted(planted, views, options, told)
+    progress_monitor = Monitor(lambda w, s: again.append(w), folder / "field.npz")
+    fitted(planted, views, options, progress_monitor)
     ridges = {w.split(":")[0] for w in again if w.startswith("ridge") and "left-out" in w}
     assert ridges == {"ridge 0.1", "ridge 0.001"}, "the first was kept"
 

@@ -186,7 +186,7 @@ def test_search_and_pictures_are_of_one_mind(planted):
     assert found.errors[0, 2, 5] == pytest.approx(expected, rel=0.02)
 
 
-def test_a_place_that_no_camera_sees_is_told(planted, tuft):
+def test_points_outside_all_cameras_are_unknown_and_black(planted, tuft):
     _, mapped = tuft
     behind = camera(180, "behind")
     hits = find_hits(mapped, behind, np.arange(400), HITS)

@@ -57,8 +57,8 @@ def tufted(small):
         maps = HairMaps.of(TRUTH) if truth is None else truth
         lights = dome(8) if lights is None else lights
         shown = mapped.with_maps(maps)
-        seen = [observed(shown, c, lights, spp) for c in cameras(views)]
-        return FitProblem(mapped, seen, exposure(seen), SKIN)
+        observed_views = [observed(shown, c, lights, spp) for c in cameras(views)]
+        return FitProblem(mapped, observed_views, exposure(observed_views), SKIN)
 
     return SimpleNamespace(
         mapped=mapped,

@@ -134,7 +134,7 @@ def test_the_same_seed_gives_the_same_numbers(plain, tufted):
     assert all((one[name] == other[name]).all() for name in one)
 
 
-def test_what_no_pixel_tells_stays(plain, tufted):
+def test_parameters_without_pixels_keep_their_values(plain, tufted):
     views = [replace(o, valid=np.zeros_like(o.valid)) for o in plain.views]
     problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
     raw = encode(HairMaps.of(tufted.truth))

@@ -29,14 +29,14 @@ def far(maps: HairMaps, truth: HairAppearance) -> float:
 
 
 def test_one_colour_and_roughness_are_found_from_pictures(plain, tufted, original):
-    seen = []
-    monitor = Monitor(lambda what, share: seen.append((what, share)))
+    reported = []
+    monitor = Monitor(lambda what, share: reported.append((what, share)))
     found = run(plain, START, options=original, monitor=monitor)
     assert found.ended == "converged"
     assert found.error < 0.5 * found.start_error
     assert far(found.maps, tufted.truth) < 0.4 < far(START, tufted.truth)
-    assert seen[0][0].startswith("start: error 0.")
-    assert [share for _, share in seen] == sorted(share for _, share in seen)
+    assert reported[0][0].startswith("start: error 0.")
+    assert [share for _, share in reported] == sorted(share for _, share in reported)
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_a_fit_from_the_truth_does_not_leave_it_for_noise(plain, tufted, origina
     ("begins", "offered", "taken"),
     [("true", "light", False), ("light", "true", True), ("true", "true", False)],
 )
-def test_what_whole_pictures_speak_against_is_not_taken(
+def test_a_step_that_worsens_full_images_is_rejected(
     plain, tufted, original, monkeypatch, begins, offered, taken
 ):
     """Whatever the fit's own pixels say."""

@@ -81,12 +81,12 @@ def made(plain, tufted, tmp_path_factory):
     return Capture(folder / "capture"), model
 
 
-def test_a_killed_fit_goes_on_and_leaves_maps_lights_and_figures(made):
+def test_killed_fit_resumes_and_writes_maps_lights_and_figures(made):
     capture, model = made
-    told = []
+    reported = []
 
     def killed(what, share):
-        told.append((what, share))
+        reported.append((what, share))
         if what.startswith("correctives"):
             raise KeyboardInterrupt
 
@@ -225,8 +225,8 @@ def test_a_doubtful_roughness_is_warned_of(made, tmp_path, monkeypatch, hair, do
         return Outcome(far, np.ones(len(problem.lights)), "converged", 1.0, 0.5)
 
     monkeypatch.setattr(pipeline, "run", found)
-    (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
-    assert told.startswith(doubt)
+    (reported,) = fit_maps(capture, other, request=REQUEST)["doubts"]
+    assert reported.startswith(doubt)
 
 
 def test_a_parameter_that_images_do_not_determine_is_warned_of(made, tmp_path, monkeypatch):
@@ -241,8 +241,8 @@ def test_a_parameter_that_images_do_not_determine_is_warned_of(made, tmp_path, m
         return Outcome(start, same, "converged", 1.0, 0.5, left_open=known)
 
     monkeypatch.setattr(pipeline, "run", found)
-    (told,) = fit_maps(capture, other, request=REQUEST)["doubts"]
-    assert told.startswith("beta_n is undetermined")
+    (reported,) = fit_maps(capture, other, request=REQUEST)["doubts"]
+    assert reported.startswith("beta_n is undetermined")
 
 
 def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
@@ -251,14 +251,16 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_pat
     shutil.copytree(model.path, other.path)
     effort = replace(REQUEST.fit.effort, pixels=10**6, spp=10**9)
     request = replace(REQUEST, fit=replace(REQUEST.fit, effort=effort))
-    told = []
+    reported = []
     monkeypatch.setattr(pipeline, "free_memory", lambda: 20.0)
     with pytest.raises(
         ModelError, match=r"takes about \d+\.\d GB of memory, and 20\.0 GB are free"
     ):
-        fit_maps(capture, other, request=request, progress=lambda what, share: told.append(what))
-    assert len(told) == 1
-    assert "GB of memory" in told[0]
+        fit_maps(
+            capture, other, request=request, progress=lambda what, share: reported.append(what)
+        )
+    assert len(reported) == 1
+    assert "GB of memory" in reported[0]
 
 
 FIT_ALONE = """
@@ -294,9 +296,9 @@ def test_the_predicted_memory_is_what_the_process_takes(made, tmp_path):
     alone = [sys.executable, "-c", FIT_ALONE, str(capture.path), str(other.path)]
     done = subprocess.run(alone, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    before, told, peak = (float(x) for x in done.stdout.split())
-    assert told == pytest.approx(peak, rel=0.3)
-    assert told - before == pytest.approx(peak - before, rel=0.4)
+    before, reported, peak = (float(x) for x in done.stdout.split())
+    assert reported == pytest.approx(peak, rel=0.3)
+    assert reported - before == pytest.approx(peak - before, rel=0.4)
 
 
 def test_unknown_fields_of_the_fit_are_refused_by_name():
@@ -305,7 +307,7 @@ def test_unknown_fields_of_the_fit_are_refused_by_name():
 
 
 @pytest.mark.slow
-def test_the_head_that_was_laid_under_points_casts_its_shadow(made, small, tmp_path):
+def test_the_fitted_head_casts_its_shadow(made, small, tmp_path):
     """A board under the tuft, of which the capture knows nothing, hides the lights below it."""
     capture, model = made
     below = [x.name for x in capture.rig.lights if x.position[2] < -0.2]

@@ -34,10 +34,10 @@ def test_black_white_sharp_and_rough_hair_survive_the_way_there_and_back(sigma_a
     np.testing.assert_allclose(found.rotation, wanted.rotation, atol=1e-9)
     assert (found.beta_m, found.eta) == (pytest.approx(beta), pytest.approx(1.55))
     assert found.tilt_deg == pytest.approx(2.0)
-    for name, slope in derivatives(raw).items():
+    for name, gradient in derivatives(raw).items():
         up, down = (decode(raw | {name: raw[name] + step}) for step in (1e-4, -1e-4))
         change = (np.atleast_1d(getattr(up, name)) - getattr(down, name)) / 2e-4
-        np.testing.assert_allclose(slope, change, rtol=1e-5)
+        np.testing.assert_allclose(gradient, change, rtol=1e-5)
 
 
 def test_squares_have_no_noise_of_two_renderings_in_them():

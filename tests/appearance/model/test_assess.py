@@ -141,7 +141,7 @@ def test_a_baseline_that_is_not_beaten_is_warned_of():
     ]
 
 
-def test_what_cannot_be_held_out_is_told_with_what_there_is(made):
+def test_invalid_held_out_names_are_refused_with_the_available_ones(made):
     capture, *_ = made
     lights, cameras = capture.olat_lights(), tuple(c.name for c in capture.rig.cameras)
     with pytest.raises(CaptureError, match=f"no light nope; its {len(lights)} are {lights[0]}, "):
@@ -207,7 +207,7 @@ def test_a_camera_that_meets_no_strand_leaves_out_the_baseline_on_strands(
     assert rows == {"ours", "mean_colour", "diffuse", "three_nearest_own_frames"}
 
 
-def test_with_nothing_held_out_the_model_is_relit_and_it_is_said(made, tmp_path):
+def test_without_held_out_frames_the_model_is_relit_with_a_warning(made, tmp_path):
     capture, model, _ = made
     copy = Model(tmp_path / "copy")
     shutil.copytree(model.path, copy.path)
@@ -494,6 +494,6 @@ def test_sparse_hair_and_a_black_room_are_relit(small, tmp_path, strands, level)
     assert (shown.max() == 255) == (level > 0)
 
 
-def test_nothing_held_out_is_an_error_that_says_so(tmp_path):
+def test_no_held_out_frames_raise_an_error(tmp_path):
     with pytest.raises(ValueError, match="held out"):
         comparison_picture(tmp_path / "x.png", [], ("captured",))

@@ -208,8 +208,8 @@ def test_of_one_camera_and_three_lights_none_is_left_out_and_the_field_is_not_re
     assert not result["rendered"]
     assert result["gain"] == [0.0, None]
     assert not model.has("field.npz")
-    told = model.report()["field"].warnings
-    assert sum("nothing could be left out" in w for w in told) == 1
+    messages = model.report()["field"].warnings
+    assert sum("nothing could be left out" in w for w in messages) == 1
 
 
 @pytest.mark.slow

@@ -54,12 +54,12 @@ def made(tmp_path):
     return Capture(tmp_path / "capture"), model
 
 
-def fit_that_scores(psnr: float, seen: list[tuple[set[str], set[str]]]):
+def fit_that_scores(psnr: float, recorded: list[tuple[set[str], set[str]]]):
     """In the place of `fit_maps`: its maps and lights, Sun's fit at 20 dB, its own at `psnr`."""
 
     def fit(capture, model, *, held_out, request, progress, seed):
         training = held_out.training(capture)
-        seen.append(({c.name for c in training.rig.cameras}, set(training.olat_lights())))
+        recorded.append(({c.name for c in training.rig.cameras}, set(training.olat_lights())))
         FOUND.save(model, np.array([[0.5, 0.5]]))
         lights = [capture.rig.light(n) for n in training.olat_lights()]
         save_lights(model, np.full(len(lights), 2.0), lights)
@@ -76,10 +76,10 @@ def fit_that_scores(psnr: float, seen: list[tuple[set[str], set[str]]]):
 @pytest.mark.parametrize(("psnr", "rendered"), [(20.5, FOUND.beta_m), (19.5, SUN.beta_m)])
 def test_the_better_fit_on_validation_frames_is_rendered(made, monkeypatch, psnr, rendered):
     capture, model = made
-    seen = []
-    monkeypatch.setattr(validated, "fit_maps", fit_that_scores(psnr, seen))
+    recorded = []
+    monkeypatch.setattr(validated, "fit_maps", fit_that_scores(psnr, recorded))
     result = fit_validated(capture, model, held_out=HELD_OUT, request=REQUEST)
-    ((cameras, lights),) = seen
+    ((cameras, lights),) = recorded
     assert cameras == {"cam_0"}
     assert len(lights) == 8
     assert "l3" not in lights

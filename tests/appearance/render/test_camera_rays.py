@@ -31,7 +31,7 @@ def discs(camera, radius_pixels, depth=1.0):
 
 @pytest.mark.parametrize("filter_sigma", [0.0, 0.5, 1.2], ids=["box", "sharp", "soft"])
 @pytest.mark.parametrize("distortion", [(), BARREL], ids=["pinhole", "lens"])
-def test_points_are_seen_where_they_are_projected(small, distortion, filter_sigma):
+def test_camera_rays_hit_points_at_their_projection(small, distortion, filter_sigma):
     camera = Camera.look_at(
         "c",
         64,

@@ -50,7 +50,7 @@ def test_well_spread_directions_keep_the_mean_and_halve_the_noise(ball):
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (5, 12), (1, 3)])
-def test_the_curve_through_a_map_meets_each_texel_once_and_goes_on_beside_it(shape):
+def test_the_curve_through_a_map_visits_each_texel_once_and_moves_to_neighbours(shape):
     order = _along_curve(*shape)
     assert sorted(order) == list(range(shape[0] * shape[1]))
     row, column = np.divmod(order, shape[1])
@@ -190,9 +190,9 @@ def test_a_white_fibre_returns_a_white_sky_whichever_way_it_runs(axis):
     scene = build_scene(Strands.from_list(list(points), radius=2e-3), None, hair=white)
     surface, directions = Surface(scene), 1024
     camera = Camera.look_at("cam", 96, 96, (-0.6, -0.5, 0.4), (0, 0, 0), 8)
-    seen = covered_pixels(scene, camera)
-    lane = dr.arange(mi.UInt32, len(seen) * directions)
-    pixel = dr.gather(mi.UInt32, mi.UInt32(for_kernels(seen, np.uint32)), lane // directions)
+    covered = covered_pixels(scene, camera)
+    lane = dr.arange(mi.UInt32, len(covered) * directions)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(for_kernels(covered, np.uint32)), lane // directions)
     row, column = pixel // 96, pixel % 96
     ray = camera_rays(camera, mi.Float(column) + 0.5, mi.Float(row) + 0.5)
     si = surface.interact(ray, mi.Bool(True))
@@ -201,7 +201,7 @@ def test_a_white_fibre_returns_a_white_sky_whichever_way_it_runs(axis):
     flat = dr.sqrt(1 - z * z)
     world = mi.Vector3f(flat * dr.cos(turn), flat * dr.sin(turn), z)
     value = surface.eval(si, si.to_local(world), si.is_valid())
-    met = np.array(si.is_valid()).reshape(len(seen), directions)[:, 0]
-    integral = 4 * np.pi * np.array(value.x).reshape(len(seen), directions)[met].mean(1)
+    met = np.array(si.is_valid()).reshape(len(covered), directions)[:, 0]
+    integral = 4 * np.pi * np.array(value.x).reshape(len(covered), directions)[met].mean(1)
     assert met.sum() > 400
     assert integral == pytest.approx(1, abs=0.01)

@@ -165,10 +165,10 @@ def test_a_sphere_casts_a_soft_shadow(small):
     x = (camera.center - rays * (camera.center[2] / rays[..., 2])[..., None])[..., 0]
     # where the line from x over the edge meets the light's height, in radii from its middle
     at = np.clip(-x * (light_height - edge_height) / edge_height / radius, -1, 1)
-    seen = 0.5 + (np.arcsin(at) + at * np.sqrt(1 - at * at)) / np.pi
-    assert seen.min() < 0.3
-    assert seen.max() > 0.7
-    np.testing.assert_allclose(soft / lit, seen, atol=0.03)
+    visible_share = 0.5 + (np.arcsin(at) + at * np.sqrt(1 - at * at)) / np.pi
+    assert visible_share.min() < 0.3
+    assert visible_share.max() > 0.7
+    np.testing.assert_allclose(soft / lit, visible_share, atol=0.03)
 
 
 @pytest.fixture(scope="module")

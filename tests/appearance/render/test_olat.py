@@ -164,7 +164,7 @@ def test_indirect_light_is_what_direct_light_lacks(small, tufted):
 
 
 @pytest.mark.slow
-def test_fibres_that_answer_by_their_width_scatter_less(small, monkeypatch):
+def test_far_field_fibres_scatter_less(small, monkeypatch):
     """Beside fibres that answer where they are met: the same light, and half of the noise.
 
     In hair as dense as this the mean over the whole width has 4 % too much light.
@@ -260,7 +260,7 @@ def test_a_moved_subject_is_a_moved_stage(small):
     np.testing.assert_allclose(a, b, rtol=0.02)
 
 
-def test_only_the_pixels_asked_for(tufted):
+def test_only_requested_pixels_are_rendered(tufted):
     scene, camera, lights = tufted
     pixels = np.array([300, 5, 301])
     some = render_olat(scene, camera, lights, spp=8, pixels=pixels)

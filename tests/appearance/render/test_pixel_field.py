@@ -72,7 +72,7 @@ class Planted:
 
 
 @pytest.fixture(scope="module")
-def seen(small):
+def observed(small):
     """The tuft with a modulation of degree 2 and with an additive field; neither falls below 0."""
     rng = np.random.default_rng(3)
     c = rng.uniform(-0.12, 0.12, (count_of(2), 3))
@@ -90,9 +90,9 @@ def patch(row, column, shape=(8, 16)):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_a_map_shows_the_sum_of_its_lights(seen, small, kind):
+def test_a_map_shows_the_sum_of_its_lights(observed, small, kind):
     """Each texel as distant lights, fine enough that they tell nothing of its size."""
-    scene, camera = seen[kind], small.camera(size=8)
+    scene, camera = observed[kind], small.camera(size=8)
     envmap = patch(2, 3) + patch(5, 11)
     far, lights = 200.0, []
     rows, columns = np.nonzero(envmap[..., 0])
@@ -132,8 +132,8 @@ def test_a_map_shows_the_sum_of_its_lights(seen, small, kind):
             assert np.abs(off).max() < (0.01 * np.abs(change).max() if kind else 0.01), name
 
 
-def test_smoothed_single_lights_have_the_field_in_full_detail(seen, small):
-    scene, camera = seen[0], small.camera(size=10)
+def test_smoothed_single_lights_have_the_field_in_full_detail(observed, small):
+    scene, camera = observed[0], small.camera(size=10)
     pixels, lights = covered_pixels(scene, camera), small.lights()
     few, bare = Sampling(16, 3), replace(scene, field=None)
     plain = olat_smoothed(bare, camera, lights, few, pixels=pixels)

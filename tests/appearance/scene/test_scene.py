@@ -87,9 +87,9 @@ def test_empty_scenes_render(small):
         image = render_olat(scene, camera, lights, spp=4)
         assert image.shape == (3, 8, 8, 3)
         assert image.max() > 0
-        seen = coverage(scene, camera)
-        assert (seen["hair"].sum() > 0) == (len(strands) > 0)
-        assert (seen["head"].sum() > 0) == (head is not None)
+        covered = coverage(scene, camera)
+        assert (covered["hair"].sum() > 0) == (len(strands) > 0)
+        assert (covered["head"].sum() > 0) == (head is not None)
 
 
 def test_coverage_of_a_ball_is_its_disc(small):
@@ -107,12 +107,12 @@ def test_other_materials_share_the_geometry(small):
     camera, lights = small.camera(), small.lights()[:1]
     scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
     dark = scene.with_hair(HairAppearance((3.0, 3.0, 3.0), 0.3, 0.3))
-    painted = scene.with_hair(DiffuseHair((0.5, 0.25, 0.0)))
-    assert dark.mi_scene is scene.mi_scene is painted.mi_scene
+    diffuse = scene.with_hair(DiffuseHair((0.5, 0.25, 0.0)))
+    assert dark.mi_scene is scene.mi_scene is diffuse.mi_scene
     hair = coverage(scene, camera)["hair"] == 1
     means = [render_olat(s, camera, lights, spp=16)[0][hair].mean(0) for s in (scene, dark)]
     assert (means[1] < 0.8 * means[0]).all()
-    colour = render_olat(painted, camera, lights, spp=16, max_depth=1)[0][hair].mean(0)
+    colour = render_olat(diffuse, camera, lights, spp=16, max_depth=1)[0][hair].mean(0)
     # the camera's filter reaches a little past fully covered pixels, onto the floor
     assert colour[1] == pytest.approx(colour[0] / 2, rel=5e-3)
     assert colour[2] < 5e-3 * colour[0]
@@ -146,12 +146,12 @@ def test_a_positive_tilt_moves_the_first_reflection_towards_the_root(bsdf):
     hair = HairAppearance((50.0, 50.0, 50.0), 0.15, 0.3, tilt_deg=3.0)
     scene = build_scene(fibre, None, hair=hair).with_hair(hair, bsdf=bsdf)
     elevations = np.arange(-20.0, 20.5, 2.0)
-    answer = []
+    results = []
     for e in np.radians(elevations):
         eye = 4 * np.array([0.0, -np.cos(e), np.sin(e)])
         camera = Camera.look_at("eye", 8, 8, eye, (0, 0, 0), fov_deg=0.05)
-        answer.append(render_olat(scene, camera, [light], spp=64, max_depth=1).mean())
-    peak = np.average(elevations, weights=np.array(answer) ** 4)
+        results.append(render_olat(scene, camera, [light], spp=64, max_depth=1).mean())
+    peak = np.average(elevations, weights=np.array(results) ** 4)
     assert peak == pytest.approx(-6.0, abs=1.0)
 
 

@@ -212,7 +212,7 @@ def test_one_view_is_enough(made, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_channel_that_frames_do_not_have_tells_nothing(made, tmp_path):
+def test_a_channel_missing_from_frames_adds_no_information(made, tmp_path):
     """As of infrared frames: the next darkest channel has the roughness."""
     change = (np.array([1, 1, 0], np.float32), np.inf)
     appearance, report = fit_of(tmp_path, made, change)

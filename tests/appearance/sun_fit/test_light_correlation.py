@@ -141,8 +141,8 @@ def test_pixels_beside_a_lights_beam_are_skipped():
     fibres = VisibleFibres(point, tangent, np.ones((101, 1), bool))
     sent = light.intensity_towards(point[:, 0]) / (1 + x**2)[:, None]
     valid = np.ones((1, 101), bool)
-    seen = Observed(camera, (light,), np.arange(101), 0.2 * sent[None] + 1e-3, valid)
-    found = mirror_samples(seen, fibres, tilt_deg=0.0, channel=0)
+    observed = Observed(camera, (light,), np.arange(101), 0.2 * sent[None] + 1e-3, valid)
+    found = mirror_samples(observed, fibres, tilt_deg=0.0, channel=0)
     angle = np.degrees(np.arctan(np.abs(x)))
     assert len(found.value) == (angle < 3.9).sum()
     assert found.value.min() >= 0.2

@@ -80,12 +80,12 @@ def test_too_few_samples_are_an_error_that_says_what_to_do():
 
 
 def test_colour_iteration_solves_a_line_in_three_steps():
-    slope, offset = np.array([0.5, 0.3, 0.2]), np.array([0.02, 0.01, 0.0])
-    target = slope * np.array([0.3, 0.4, 0.6]) + offset
+    gains, offset = np.array([0.5, 0.3, 0.2]), np.array([0.02, 0.01, 0.0])
+    target = gains * np.array([0.3, 0.4, 0.6]) + offset
     pairs = []
     colour = np.full(3, 0.5)
     for _ in range(3):
-        pairs.append((colour, slope * colour + offset))
+        pairs.append((colour, gains * colour + offset))
         colour = next_colour(pairs, target)
     np.testing.assert_allclose(colour, [0.3, 0.4, 0.6], rtol=1e-12)
 
@@ -193,17 +193,17 @@ def test_what_strands_lack_does_not_lighten_the_hair(wisp):
     o = observed(scene, camera, lights[::6], 64)
     bare = o.pixels % camera.width > 11
     radiance = np.where(bare[:, None], o.radiance[:, ~bare].mean(axis=1, keepdims=True), o.radiance)
-    seen = FitPixels([replace(o, radiance=radiance)])
-    kept = covered(seen, scene)
+    fitted_pixels = FitPixels([replace(o, radiance=radiance)])
+    kept = covered(fitted_pixels, scene)
     assert 0.3 < len(kept.hair[0].pixels) / len(o.pixels) < 0.75
     start = scene.with_hair(replace(truth, sigma_a=(0.5, 0.5, 0.5)))
     found, lighter = (
-        fit_colour(start, p, sampling=replace(SAMPLING, spp=64)) for p in (kept, seen)
+        fit_colour(start, p, sampling=replace(SAMPLING, spp=64)) for p in (kept, fitted_pixels)
     )
     np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.15)
     assert np.max(np.divide(lighter.hair.sigma_a, truth.sigma_a)) < 0.8
     nothing = build_scene(strands.subset(strands.roots[:, 0] < -0.035), None, hair=truth)
-    assert covered(seen, nothing).hair is seen.hair
+    assert covered(fitted_pixels, nothing).hair is fitted_pixels.hair
 
 
 @pytest.fixture(scope="module")
@@ -220,8 +220,8 @@ def brighter_behind(wisp):
 @pytest.mark.slow
 def test_colours_are_compared_under_lights_before_the_hair(brighter_behind):
     scene, o = brighter_behind
-    seen = FitPixels([o])
-    front = in_front(seen, scene)
+    fitted_pixels = FitPixels([o])
+    front = in_front(fitted_pixels, scene)
     chosen = {light.name for light in front.hair[0].lights}
     beside = 0.05  # the top light is on neither side
     assert chosen >= {light.name for light in o.lights if light.position[1] < -beside}
@@ -230,7 +230,7 @@ def test_colours_are_compared_under_lights_before_the_hair(brighter_behind):
     assert in_front(FitPixels([behind]), scene).hair[0] is behind
     found, by_all = (
         np.array(fit_colour(scene, x, sampling=replace(SAMPLING, spp=64)).hair.sigma_a)
-        for x in (front, seen)
+        for x in (front, fitted_pixels)
     )
     assert (found > 1.01 * by_all).all()
     np.testing.assert_allclose(by_all, scene.hair.sigma_a, rtol=0.3)

@@ -152,8 +152,8 @@ def _capture(out: Path, stepping: str) -> dict[str, Any]:
     time has the drivers' and the writer's work in it, on all threads.
     """
     with simulated(_rig("modbus_tcp")) as rig_file:
-        asked = CapturePlan(stepping="hardware" if stepping == "hardware" else "software")
-        plan = resolve(asked, rig_file)
+        requested = CapturePlan(stepping="hardware" if stepping == "hardware" else "software")
+        plan = resolve(requested, rig_file)
         steps, cost = plan.steps, plan.cost
         for attempt in range(2):
             folder = out / str(attempt)

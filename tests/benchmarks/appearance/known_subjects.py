@@ -78,12 +78,12 @@ class SmallStage:
         sampling: tuple[int, int],
     ) -> Floats:
         spp, seed = sampling
-        spent: dict[str, Any] = {"spp": spp, "max_depth": self.max_depth, "seed": seed}
+        render_options: dict[str, Any] = {"spp": spp, "max_depth": self.max_depth, "seed": seed}
         if not self.clean_spp:
-            return render_olat(scene, camera, lights, pixels=pixels, **spent)
-        rest = render_indirect(scene, camera, lights, pixels, **spent)
-        spent |= {"spp": 2 * spp, "max_depth": 1, "seed": seed + (1 << 31)}
-        direct = render_olat(scene, camera, lights, pixels=pixels, **spent)
+            return render_olat(scene, camera, lights, pixels=pixels, **render_options)
+        rest = render_indirect(scene, camera, lights, pixels, **render_options)
+        render_options |= {"spp": 2 * spp, "max_depth": 1, "seed": seed + (1 << 31)}
+        direct = render_olat(scene, camera, lights, pixels=pixels, **render_options)
         share = np.zeros((camera.height, camera.width), np.float32)
         share.reshape(-1)[pixels] = 1
         shares = {"hair": share, "head": np.zeros_like(share)}

@@ -91,11 +91,11 @@ def processor(variant: str) -> str | None:
         return f"CPU, {len(os.sched_getaffinity(0))} threads"
     if not dr.has_backend(dr.JitBackend.CUDA):
         return None
-    asked = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-    if shutil.which(asked[0]) is None:
+    query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    if shutil.which(query[0]) is None:
         return "a GPU"
-    told = subprocess.run(asked, capture_output=True, text=True).stdout.splitlines()
-    return told[0] if told else "a GPU"
+    output = subprocess.run(query, capture_output=True, text=True).stdout.splitlines()
+    return output[0] if output else "a GPU"
 
 
 def done_by(variant: str, job: Job) -> Done:

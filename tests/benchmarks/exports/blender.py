@@ -69,17 +69,17 @@ def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         result.update(more)
         save(args.out / "exports.json", result)
 
-    def ask(job: dict[str, Any]) -> dict[str, Any]:
+    def run_job(job: dict[str, Any]) -> dict[str, Any]:
         return _in_blender(args.blender, work, job)
 
     progress("what Blender finds", 0.0)
-    keep(opened=_opened(fitted, Groom.load(Model(args.model), capture), work, ask))
+    keep(opened=_opened(fitted, Groom.load(Model(args.model), capture), work, run_job))
     progress("colours", 0.2)
-    colours, picture = _colours(fitted, capture, effort, work, ask)
+    colours, picture = _colours(fitted, capture, effort, work, run_job)
     keep(colours=colours)
     cv2.imwrite(str(args.out / "exports.png"), picture[..., ::-1])
     progress(f"{effort.many:,} strands", 0.7)
-    keep(exporters=_exporters(fitted, effort.many, work, ask))
+    keep(exporters=_exporters(fitted, effort.many, work, run_job))
     (args.out / "exports.md").write_text(tables(result))
     return result
 
@@ -91,20 +91,20 @@ def _in_blender(python: Path, work: Path, job: dict[str, Any]) -> dict[str, Any]
     done = subprocess.run([python, IN_BPY, file], capture_output=True, text=True)
     if done.returncode:
         raise LeftOut(f"{python}: {(done.stderr or done.stdout)[-600:]}")
-    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return answer
+    outcome: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return outcome
 
 
-Ask = Callable[[dict[str, Any]], dict[str, Any]]
+RunJob = Callable[[dict[str, Any]], dict[str, Any]]
 
 
-def _opened(fitted: FittedModel, groom: Groom, work: Path, ask: Ask) -> dict[str, Any]:
+def _opened(fitted: FittedModel, groom: Groom, work: Path, run_job: RunJob) -> dict[str, Any]:
     """By export: counts, radius in metres, and how far its box and its head's are off, metres."""
     files = {"abc": work / "hair.abc", "usd": work / "hair.usdc", "blender": work / "blender"}
     write_strands(files["abc"], groom.strands)
     export_usd(groom, files["usd"])
     export_blender(groom, files["blender"])
-    found = ask({"open": {name: str(file) for name, file in files.items()}})
+    found = run_job({"open": {name: str(file) for name, file in files.items()}})
     for name, row in found.items():
         row["box_off"] = _off(row, groom.strands.points)
         if "head" in row and fitted.head is not None:
@@ -125,7 +125,7 @@ def _size(path: Path) -> int:
 
 
 def _colours(
-    fitted: FittedModel, capture: Capture, effort: Effort, work: Path, ask: Ask
+    fitted: FittedModel, capture: Capture, effort: Effort, work: Path, run_job: RunJob
 ) -> tuple[dict[str, Any], Array]:
     """Cycles' mean radiance over ours, of hair and of skin, by thickness and light; a picture."""
     camera = three_quarter_view(fitted.strands, effort.size)
@@ -152,7 +152,7 @@ def _colours(
                 for name, light in lights.items()
             },
         }
-        seconds = ask({"render": {"cycles": view}})["cycles"]
+        seconds = run_job({"render": {"cycles": view}})["cycles"]
         ratios[thickness] = {}
         for mine, name in zip(ours, lights, strict=True):
             theirs = _read(work / f"{name}.exr")
@@ -197,7 +197,7 @@ def _ratio(theirs: Array, ours: Floats, mask: Bools) -> list[float]:
     return [float(x) for x in theirs[mask].mean(axis=0) / mean] if lit else []
 
 
-def _exporters(fitted: FittedModel, many: int, work: Path, ask: Ask) -> dict[str, Any]:
+def _exporters(fitted: FittedModel, many: int, work: Path, run_job: RunJob) -> dict[str, Any]:
     """Seconds and bytes of our exporters and of Blender's, of `many` strands."""
     times = -(-many // len(fitted.strands))
     moved = np.random.default_rng(0).normal(scale=1e-3, size=(times, 3)).astype(np.float32)
@@ -221,7 +221,7 @@ def _exporters(fitted: FittedModel, many: int, work: Path, ask: Ask) -> dict[str
     export_blender(groom, work / "many")
     theirs = {"abc": work / "theirs.abc", "usd": work / "theirs.usdc"}
     job = {"groom": str(work / "many"), "abc": str(theirs["abc"]), "usd": str(theirs["usd"])}
-    for name, row in ask({"write": job})["write"].items():
+    for name, row in run_job({"write": job})["write"].items():
         out[f"Blender's, {name}"] = {**row, "bytes": _size(theirs[name])}
     return out
 

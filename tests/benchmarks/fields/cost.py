@@ -44,14 +44,14 @@ def cost(size: tuple[int, int, int], folder: Path, seed: int, progress: Progress
     ]
     marks: list[tuple[str, float]] = []
 
-    def told(what: str, share: float) -> None:
+    def show_progress(what: str, share: float) -> None:
         name = "validation" if what.startswith("ridge") else what.split(": ")[-1]
         if not marks or marks[-1][0] != name:
             marks.append((name, time.process_time()))
         progress(what, share)
 
     begun, before = time.process_time(), _peak()
-    found = fit_pictures(views, Places.of(roots), 1.0, request.fit, Monitor(told))
+    found = fit_pictures(views, Places.of(roots), 1.0, request.fit, Monitor(show_progress))
     ended = time.process_time()
     for view in views:
         (folder / f"{view.hits.camera.name}.npy").unlink()

@@ -173,8 +173,8 @@ def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:
         pictures.append(Pictures(hits, lights, np.stack(halves[1]), captured, valid))
     held_lights = tuple(range(1, len(lights), 3))
     kept = [i for i in range(len(lights)) if i not in held_lights]
-    seen = [p.captured[kept] for k, p in enumerate(pictures) if k not in held]
-    scale = Exposure.of(x.reshape(-1, 3) for x in seen).scale
+    observed = [p.captured[kept] for k, p in enumerate(pictures) if k not in held]
+    scale = Exposure.of(x.reshape(-1, 3) for x in observed).scale
     return Frames(
         tuple(pictures),
         tuple(true),

@@ -215,8 +215,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for i in range(1 if args.quick else args.seeds):
         seed = args.seed + i
         subject = simulated(args.rig, args.subject, args.head, seed)
-        told = within(progress, f"seed {seed}", i / args.seeds, 1 / args.seeds)
-        found["seeds"][seed] = measure(subject, size, seed, told)
+        report_progress = within(progress, f"seed {seed}", i / args.seeds, 1 / args.seeds)
+        found["seeds"][seed] = measure(subject, size, seed, report_progress)
         found["mean"] = _means([x["rows"] for x in found["seeds"].values()])
         save(args.out / "interpolation.json", found)
     return found

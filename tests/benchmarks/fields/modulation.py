@@ -70,9 +70,9 @@ def interpolated(frames: Frames, progress: Progress) -> dict[str, dict[str, floa
     lights = frames.pictures[0].lights
     kept = [i for i in range(len(lights)) if i not in frames.held_lights]
     own = [k for k in range(len(frames.pictures)) if k not in frames.held_views]
-    seen = [frames.pictures[k] for k in own]
-    tables = [p.captured[kept].astype(np.float16) for p in seen]
-    cameras = zip(seen, tables, strict=True)
+    observed = [frames.pictures[k] for k in own]
+    tables = [p.captured[kept].astype(np.float16) for p in observed]
+    cameras = zip(observed, tables, strict=True)
     views = tuple(CapturedView(p.hits.camera, p.hits.pixels, t) for p, t in cameras)
     field = ReflectanceField(tuple(lights[i] for i in kept), views, 1.0)
     standard = Interpolation.of(field, frames.mapped, frames.strands)

@@ -70,10 +70,10 @@ def _scored(capture: Capture, model: Model, truth: StrandTruth, seed: int) -> di
 
 
 def _imported(
-    work: Path, seen: Capture, written: Written, args: argparse.Namespace
+    work: Path, observed: Capture, written: Written, args: argparse.Namespace
 ) -> tuple[Capture, Model]:
     """The capture written out, imported and reconstructed by the commands."""
-    folder = write_folder(seen, work / "folder", written, args.seed)
+    folder = write_folder(observed, work / "folder", written, args.seed)
     _command("import", folder, "--out", work / "capture", "--json")
     model, options = work / "model", json.dumps(_options(args))
     _command("reconstruct", work / "capture", "--out", model, "--options", options, "--json")
@@ -104,11 +104,11 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise LeftOut(f"no damage {args.only!r}; there are {', '.join(DAMAGES)}")
     if args.quick:
         damages = {ALL: DAMAGES[ALL]}
-    seen, folder = _shot(args, within(progress, "capture", 0.0, 0.3))
-    truth = StrandTruth(seen, folder)
+    observed, folder = _shot(args, within(progress, "capture", 0.0, 0.3))
+    truth = StrandTruth(observed, folder)
     results: dict[str, Any] = {
-        "cameras": len(seen.rig.cameras),
-        "lights": len(seen.olat_lights()),
+        "cameras": len(observed.rig.cameras),
+        "lights": len(observed.olat_lights()),
         "rows": {},
     }
     for k, (name, written) in enumerate({"direct": None, **damages}.items()):
@@ -117,10 +117,10 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             if written is None:
                 model = Model(Path(work) / "model")
                 options = parse_options(ReconstructOptions, _options(args))
-                reconstruct(seen, model, method="auto", options=options)
-                capture = seen
+                reconstruct(observed, model, method="auto", options=options)
+                capture = observed
             else:
-                capture, model = _imported(Path(work), seen, written, args)
+                capture, model = _imported(Path(work), observed, written, args)
             results["rows"][name] = _scored(capture, model, truth, args.seed)
         save(args.out / "importing.json", results)
         (args.out / "importing.md").write_text(table(results))

@@ -24,7 +24,7 @@ BLOCK = 1 << 14  # pixels that are painted together: they stay in the cache
 SHIFTS = 64  # pixels by which the noise differs from frame to frame
 
 
-class PaintedCapture(Capture):
+class DrawnCapture(Capture):
     """A capture of the groom "wavy" of which the folder holds no frame; see `write`.
 
     Hair answers as Kajiya and Kay (1989) say, skin as a matte ball would; nothing casts a shadow.
@@ -47,7 +47,7 @@ class PaintedCapture(Capture):
         write_obj(folder / "head.obj", head)
         strands = make_subject("wavy", seed).strands
         for camera in rig.cameras:
-            _Seen.of(camera, strands, head).save(folder / f"{camera.name}.npz")
+            _View.of(camera, strands, head).save(folder / f"{camera.name}.npz")
         return cls(folder)
 
     def __init__(self, path: str | Path) -> None:
@@ -57,36 +57,36 @@ class PaintedCapture(Capture):
             for s in self.steps
             for c in self.rig.cameras
         }
-        self._seen: dict[str, _Seen] = {}
+        self._views: dict[str, _View] = {}
 
     def _read(self, step: Step, camera: str) -> tuple[Floats, dict[str, float | str]]:
-        if camera not in self._seen:
-            self._seen.clear()  # the pipeline goes camera by camera
-            self._seen[camera] = _Seen.load(self.path / f"{camera}.npz")
-        seen = self._seen[camera]
+        if camera not in self._views:
+            self._views.clear()  # the pipeline goes camera by camera
+            self._views[camera] = _View.load(self.path / f"{camera}.npz")
+        view = self._views[camera]
         x, y = np.random.default_rng(step.index).integers(0, SHIFTS, 2)
-        height, width = seen.shape
+        height, width = view.shape
         out = _noise(height, width)[y : y + height, x : x + width].copy()
         flat = out.reshape(-1, 3)
         if step.kind == "scanline" and step.projector is not None and step.row is not None:
             projector = self.rig.projector(step.projector)
-            order, rows = seen.rows(projector)
+            order, rows = view.rows(projector)
             first, last = np.searchsorted(rows, (step.row - 3, step.row + 3))
             lit = order[first:last]
             share = projector.row_weight(step.row, rows[first:last]).astype(np.float32)
-            flat[seen.at[lit]] += share[:, None] * seen.answers(projector.center, lit)
+            flat[view.at[lit]] += share[:, None] * view.reflectance(projector.center, lit)
         elif step.kind == "olat" and step.light is not None:
             position = self.rig.light(step.light).position
-            for begin in range(0, len(seen.at), BLOCK):
+            for begin in range(0, len(view.at), BLOCK):
                 part = slice(begin, begin + BLOCK)
-                flat[seen.at[part]] += seen.answers(position, part)
+                flat[view.at[part]] += view.reflectance(position, part)
         elif step.kind == "all_on":
-            flat[seen.at] += seen.colour
+            flat[view.at] += view.colour
         return out, {}
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _View:
     """What one camera sees: pixels `at (P,)`, their points, normals and tangents `(P, 3)`.
 
     Where there is skin the tangent is 0. `colour (P, 3)`; `away (P,)` is the tangent's sine to the
@@ -102,7 +102,7 @@ class _Seen:
     away: Floats
 
     @classmethod
-    def of(cls, camera: Camera, strands: Strands, head: Mesh) -> _Seen:
+    def of(cls, camera: Camera, strands: Strands, head: Mesh) -> _View:
         """Strands drawn from the furthest to the nearest, and the head between them."""
         pixels, depth = camera.project(strands.points)
         inner = np.ones(len(strands.points), bool)
@@ -140,13 +140,13 @@ class _Seen:
         np.savez(file, **{f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def load(cls, file: Path) -> _Seen:
+    def load(cls, file: Path) -> _View:
         """What was kept."""
         with np.load(file) as data:
             found = {f.name: data[f.name] for f in fields(cls)}
         return cls(**(found | {"shape": tuple(found["shape"].tolist())}))
 
-    def answers(self, position: Array, some: Ints | slice) -> Floats:
+    def reflectance(self, position: Array, some: Ints | slice) -> Floats:
         """What `some` of the pixels answer to a light at `position (3,)`: `(Q, 3)`."""
         to = position.astype(np.float32) - self.points[some]
         to /= np.sqrt(np.einsum("pi,pi->p", to, to))[:, None]

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.command import Benchmark, option, within
-from benchmarks.importing.painted import PaintedCapture
+from benchmarks.importing.drawn import DrawnCapture
 from benchmarks.results import save
 from reconstruction import Camera, Model, Progress, Rig, reconstruct
 from reconstruction.estimate import estimate
@@ -64,15 +64,15 @@ def measure(
     size: Size, method: Method, folder: Path, seed: int, progress: Progress
 ) -> dict[str, Any]:
     """The estimate and the run of one capture; stages are told beside what they took."""
-    painted = PaintedCapture.write(
+    drawn = DrawnCapture.write(
         folder / "capture", size.rig(), sweep=size.sweep, all_on=size.sweep, seed=seed
     )
-    capture = painted.view(reduced=size.reduced)
-    told = estimate(capture, method=method, progress=within(progress, "estimate", 0.0, 0.05))
-    tell = within(progress, "reconstruct", 0.05, 0.9)  # where it ends, bars say no more
-    report = reconstruct(capture, Model(folder / "model"), method=method, progress=tell)
+    capture = drawn.view(reduced=size.reduced)
+    estimated = estimate(capture, method=method, progress=within(progress, "estimate", 0.0, 0.05))
+    report_progress = within(progress, "reconstruct", 0.05, 0.9)  # where it ends, bars say no more
+    report = reconstruct(capture, Model(folder / "model"), method=method, progress=report_progress)
     taken = {s.name: {"seconds": s.seconds, "peak_gb": s.peak_gb or 0.0} for s in report.stages}
-    for stage in told.stages:
+    for stage in estimated.stages:
         if mine := taken.get(stage.name):
             mine["seconds_over_estimate"] = mine["seconds"] / max(stage.seconds, 1.0)
             mine["peak_over_estimate"] = mine["peak_gb"] / stage.peak_gb
@@ -80,10 +80,11 @@ def measure(
     peak = max(s["peak_gb"] for s in taken.values())
     return {
         "size": asdict(size),
-        "estimated": asdict(told) | {"seconds": told.seconds, "peak_gb": told.peak_gb},
+        "estimated": asdict(estimated)
+        | {"seconds": estimated.seconds, "peak_gb": estimated.peak_gb},
         "taken": {"stages": taken, "seconds": seconds, "peak_gb": peak},
-        "seconds_over_estimate": seconds / told.seconds,
-        "peak_over_estimate": peak / told.peak_gb,
+        "seconds_over_estimate": seconds / estimated.seconds,
+        "peak_over_estimate": peak / estimated.peak_gb,
         "goals": {"peak_gb": MEMORY_GB, "within": WITHIN},
     }
 
@@ -97,11 +98,11 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         for method in args.methods:
             row = f"{name}, {method}"
 
-            def tell(what: str, share: float, row: str = row) -> None:
+            def report_progress(what: str, share: float, row: str = row) -> None:
                 progress(f"{row}: {what}", share)
 
             with TemporaryDirectory(dir=args.out) as folder:
-                results[row] = measure(size, method, Path(folder), args.seed, tell)
+                results[row] = measure(size, method, Path(folder), args.seed, report_progress)
             save(args.out / "large.json", results)
     return results
 

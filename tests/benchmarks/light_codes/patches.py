@@ -87,8 +87,8 @@ def run_patch(
     for k, (name, method, some) in enumerate(runs):
         model = Model(out / name.replace(", ", "_").replace(" ", "_"))
         begin = time.perf_counter(), time.process_time()
-        tell = within(progress, name, 0.4 + k * part, part)
-        report = reconstruct(some, model, method=method, options=options, progress=tell)
+        report_progress = within(progress, name, 0.4 + k * part, part)
+        report = reconstruct(some, model, method=method, options=options, progress=report_progress)
         results["variants"][name] = {
             **truth.score(model.strands()),
             "seconds": time.perf_counter() - begin[0],

@@ -110,12 +110,12 @@ def demo_job(
     steps: Sequence[str] = JOB,
 ) -> dict[str, Any]:
     """What the steps of the demo's job on `capture` tell, by their names."""
-    asked = options.model_copy(update={"truth": str(truth), **hold_out(capture.rig)})
+    requested = options.model_copy(update={"truth": str(truth), **hold_out(capture.rig)})
     done: dict[str, Any] = {}
     for k, name in enumerate(steps):
-        tell = within(progress, name, k / len(steps), 1 / len(steps))
+        report_progress = within(progress, name, k / len(steps), 1 / len(steps))
         begin = time.perf_counter()
-        figures = STEPS[name](StepContext(capture.path, model, asked, tell, done))
+        figures = STEPS[name](StepContext(capture.path, model, requested, report_progress, done))
         done[name] = {"figures": figures, "seconds": time.perf_counter() - begin}
     return {name: of_step["figures"] for name, of_step in done.items()}
 
@@ -138,7 +138,7 @@ def judge(
     cloud, head = triangulate(capture), capture.head
     assert head is not None
     true = true_masks(capture, truth_folder)
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     kinds = {
         "automatic": hair_masks(capture, cloud, head),
         "without head": hair_masks(capture, cloud),
@@ -148,7 +148,7 @@ def judge(
         stage = Stage("envelope")
         masked = MaskedCapture(capture, masks)
         build_envelope(masked, cloud, head, grid=2e-3, margin=2e-3, stage=stage)
-        told[kind] = {
+        reported[kind] = {
             "overlap": overlaps(masks, true),
             "disagreement": disagreements(masks, capture.rig.cameras, cloud, head),
             "envelope_litres": stage.figures["envelope_litres"],
@@ -157,28 +157,35 @@ def judge(
     for name, mask in true.items():
         (given.path / "masks").mkdir(exist_ok=True)
         cv2.imwrite(str(given.path / "masks" / f"{name}.png"), 255 * mask.hair.astype(np.uint8))
-    told["jobs"], told["drawn_again"], share = {}, [], 1 / (1 + draws)
+    reported["jobs"], reported["drawn_again"], share = {}, [], 1 / (1 + draws)
     for k, (kind, shot) in enumerate({"automatic": capture, "true": given}.items()):
-        model, tell = Model(out / kind), within(progress, f"{kind} masks", k * share, share)
-        demo_job(shot, truth_folder, model, options, tell)
-        told["jobs"][kind] = model.json("results.json")
+        model, report_progress = (
+            Model(out / kind),
+            within(progress, f"{kind} masks", k * share, share),
+        )
+        demo_job(shot, truth_folder, model, options, report_progress)
+        reported["jobs"][kind] = model.json("results.json")
     for k in range(1, draws):
-        model, tell = (
+        model, report_progress = (
             Model(out / f"draw_{k}"),
             within(progress, f"draw {k}", (1 + k) * share, share),
         )
         again = options.model_copy(update={"seed": options.seed + k})
-        found = demo_job(capture, truth_folder, model, again, tell, ("reconstruct", "evaluate"))
-        told["drawn_again"].append({over: found["evaluate"][over] for over in ("visible", "all")})
+        found = demo_job(
+            capture, truth_folder, model, again, report_progress, ("reconstruct", "evaluate")
+        )
+        reported["drawn_again"].append(
+            {over: found["evaluate"][over] for over in ("visible", "all")}
+        )
     alone, model = SingleLights(folder), Model(out / "single_lights_alone")
     reconstruct(alone, model, method="auto")
     truth = StrandTruth(capture, truth_folder)
-    told["single lights alone"] = {
+    reported["single lights alone"] = {
         "overlap": overlaps(hair_masks(alone), true),
         "head_mm": _apart(model.head(alone), head),
         "strands": {"ours": truth.score(model.strands()), **truth.baselines(model)},
     }
-    return told
+    return reported
 
 
 def _apart(found: Mesh | None, true: Mesh) -> dict[str, float] | None:
@@ -224,12 +231,16 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     results: dict[str, Any] = {}
     captures = _captures(args)
     for k, ((name, paths), capture) in enumerate(captures.items()):
-        tell = within(progress, f"{name}, {paths} paths", k / len(captures), 1 / len(captures))
-        folder, truth = capture.make(args.cache, within(tell, "capture", 0.0, 0.7))
+        report_progress = within(
+            progress, f"{name}, {paths} paths", k / len(captures), 1 / len(captures)
+        )
+        folder, truth = capture.make(args.cache, within(report_progress, "capture", 0.0, 0.7))
         options = JobOptions.model_validate(QUICK if args.quick else {})
         options = options.model_copy(update={"seed": args.seed})
         into = args.out / f"masks-{name}-{paths}"
-        judged = judge(folder, truth, into, options, args.draws, within(tell, "judged", 0.7, 0.3))
+        judged = judge(
+            folder, truth, into, options, args.draws, within(report_progress, "judged", 0.7, 0.3)
+        )
         results.setdefault(name, {})[str(paths)] = judged
         save(args.out / "masks.json", results)
         (args.out / "masks.md").write_text(report(results, args.seed))
@@ -241,8 +252,8 @@ def report(results: Mapping[str, Mapping[str, Any]], seed: int) -> str:
     jobs, text = {}, []
     for name, of_paths in results.items():
         for paths, judged in of_paths.items():
-            told = judged["automatic"]["overlap"].values()
-            text.append(f"- {name}, {paths} paths: masks overlap by {min(told):.3f} at least")
+            reported = judged["automatic"]["overlap"].values()
+            text.append(f"- {name}, {paths} paths: masks overlap by {min(reported):.3f} at least")
             again = [f["visible"] for f in judged["drawn_again"]]
             drawn = [judged["jobs"]["automatic"]["geometry"]["visible"], *again]
             for at in THRESHOLDS:

@@ -59,9 +59,9 @@ def motion_errors(
         shifts.append(np.linalg.norm(centre @ (ra - rb).T + ta - tb))
         for camera in capture.rig.cameras:
             a, b = camera.project(ours), camera.project(theirs)
-            seen = (b[1] > 0) & camera.inside(b[0])
+            visible = (b[1] > 0) & camera.inside(b[0])
             scale = PAPER_PIXELS / max(camera.width, camera.height)
-            pixels.append(scale * np.linalg.norm(a[0] - b[0], axis=1)[seen])
+            pixels.append(scale * np.linalg.norm(a[0] - b[0], axis=1)[visible])
     return {
         "pixels": _spread(np.concatenate(pixels)),
         "mm": _spread(1e3 * np.concatenate(metres)),

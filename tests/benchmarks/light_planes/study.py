@@ -121,11 +121,14 @@ class _Runs:
     def add(self, name: str, capture: Capture, motion: Motion | None = None) -> Report:
         """Reconstruct into a model of that name."""
         model = Model(self.out / name.replace(" ", "_"))
-        begin, spent = time.perf_counter(), time.process_time()
+        begin, cpu_start = time.perf_counter(), time.process_time()
         report = reconstruct(
             capture, model, options=self.options, motion=motion, progress=self.progress
         )
-        took = {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - spent}
+        took = {
+            "seconds": time.perf_counter() - begin,
+            "cpu_seconds": time.process_time() - cpu_start,
+        }
         self.scores[name] = {**self.truth.score(model.strands()), **took}
         save(self.out / "result.json", {"scores": self.scores})
         return report

@@ -165,7 +165,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for k, (name, framing) in enumerate(framings.items()):
         if name in ("sintel", "ponytail") and data_folder() is None:
             continue
-        tell = within(progress, name, k / len(framings), 1 / len(framings))
+        report_progress = within(progress, name, k / len(framings), 1 / len(framings))
         if framing is None:
             made, options = [demo_capture(args.seed)], ReconstructOptions()
         else:
@@ -182,12 +182,12 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             options = replace(options, grid=4e-3, roots=500)
         study(
             folder / name,
-            SubjectCaptures(*(capture.make(args.cache, tell) for capture in made)),
+            SubjectCaptures(*(capture.make(args.cache, report_progress) for capture in made)),
             options,
             grown="grown" in also,
             without_help="without_help" in also,
             studies=name == "sintel" and "studies" in also,
-            progress=tell,
+            progress=report_progress,
         )
     done = {f.parent.name: json.loads(f.read_text()) for f in sorted(folder.glob("*/result.json"))}
     results = {"paper": PAPER, "subjects": done}

@@ -77,10 +77,10 @@ def copied(capture: Capture, folder: Path, *, rig: Rig | None = None, head: bool
 
 def rig_errors(found: Rig, truth: Rig) -> dict[str, float]:
     """The mean over devices of what `compare_rigs` tells of each."""
-    told = compare_rigs(found, truth)
+    comparison = compare_rigs(found, truth)
     return {
         f"{kind}: {what}": float(np.mean([np.mean(device[what]) for device in devices.values()]))
-        for kind, devices in told.items()
+        for kind, devices in comparison.items()
         for what in next(iter(devices.values()))
     }
 

@@ -115,10 +115,10 @@ class _Errors:
         )
 
     def _curves(self, count: int) -> dict[str, Any]:
-        lights, seen, effort = dome(count, self.view.seed), min(count, _JUDGED), self.effort
+        lights, judged_count, effort = dome(count, self.view.seed), min(count, _JUDGED), self.effort
         methods: dict[str, Callable[[int, int], Floats]] = {
             "ours": lambda spp, seed: self._ours(lights, spp, seed),
-            "mitsuba path": lambda spp, seed: self._path(self.judged[:seen], spp, seed),
+            "mitsuba path": lambda spp, seed: self._path(self.judged[:judged_count], spp, seed),
         }
         for method in [*methods.values()] * 2:  # a second call may compile a second variant
             method(min(effort.spp), self.view.seed)
@@ -130,14 +130,16 @@ class _Errors:
                     wall, cpu = time.perf_counter(), time.process_time()
                     image = method(counts[turn], self.view.seed + 10 + turn)
                     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-                    scale = count / seen if name == "mitsuba path" else 1.0
+                    scale = count / judged_count if name == "mitsuba path" else 1.0
                     series.append(
                         {
                             "method": name,
                             "spp": counts[turn],
                             "seconds": wall * scale,
                             "cpu_seconds": cpu * scale,
-                            "rel_mse": relative_mse(image[:seen], *(h[:seen] for h in self.halves)),
+                            "rel_mse": relative_mse(
+                                image[:judged_count], *(h[:judged_count] for h in self.halves)
+                            ),
                         }
                     )
         return {"series": series, "gain": _gains(series)}

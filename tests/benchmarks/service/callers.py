@@ -130,7 +130,7 @@ class _Load:
             MODEL,
             *filter(None, [token]),
         ]
-        self.answers: dict[str, int] = {}
+        self.responses: dict[str, int] = {}
 
     def __enter__(self) -> Self:
         pipe = subprocess.PIPE
@@ -141,13 +141,13 @@ class _Load:
     def __exit__(self, *_: object) -> None:
         out, _err = self._child.communicate(timeout=HURRY_S)
         for status, count in json.loads(out).items():
-            self.answers[status] = self.answers.get(status, 0) + count
+            self.responses[status] = self.responses.get(status, 0) + count
 
 
 def _capture(live: Live) -> float:
     """Seconds of a capture that nobody asks about until its end."""
-    capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
-    while (status := live.ask("GET", f"/captures/{capture}"))["state"] != "done":
+    capture = live.call("POST", "/captures", {"plan": PLAN})["id"]
+    while (status := live.call("GET", f"/captures/{capture}"))["state"] != "done":
         time.sleep(0.25)
     assert status["outcome"] == "completed", status
     return float(status["seconds"])
@@ -160,8 +160,8 @@ def _blackout(
     with fault(live), live.client(live.http.base_url, limits=ONE_EACH) as http:
         began = time.monotonic()
         try:
-            answer = http.post("/devices/blackout", timeout=30)
-            said = answer.json()["state"] if answer.is_success else str(answer.status_code)
+            response = http.post("/devices/blackout", timeout=30)
+            said = response.json()["state"] if response.is_success else str(response.status_code)
         except httpx.HTTPError as error:
             said = type(error).__name__
         return time.monotonic() - began, said
@@ -203,7 +203,7 @@ def _cell(live: Live, load: str, capture: str, token: str, pairs: int) -> dict[s
         with crowd:
             for number in range(BLACKOUTS):
                 for name, fault in FAULTS.items():
-                    live.ask("POST", "/captures", {"plan": PLAN})
+                    live.call("POST", "/captures", {"plan": PLAN})
                     time.sleep(0.5 + 0.2 * number)
                     blackouts[name].append(_blackout(live, fault))
                     _settle(live)
@@ -222,7 +222,7 @@ def _cell(live: Live, load: str, capture: str, token: str, pairs: int) -> dict[s
             "failed": page.failed,
             "looks": page.looks,
         },
-        "answers": crowd.answers,
+        "answers": crowd.responses,
     }
 
 
@@ -234,8 +234,8 @@ def _settle(live: Live) -> None:
     """Wait until nothing runs, and all is dark."""
     deadline = time.monotonic() + HURRY_S
     while True:
-        dark = live.ask("POST", "/devices/blackout")["state"] == "dark"
-        if dark and live.ask("GET", "/health")["capture"] is None:
+        dark = live.call("POST", "/devices/blackout")["state"] == "dark"
+        if dark and live.call("GET", "/health")["capture"] is None:
             return
         assert time.monotonic() < deadline, "it never came to rest"
         time.sleep(0.1)
@@ -264,7 +264,7 @@ def run(
             tokens = {
                 name: known.make(name, CALLERS[name]) if CALLERS[name] else "" for name in callers
             }
-            capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
+            capture = live.call("POST", "/captures", {"plan": PLAN})["id"]
             live.until_done(capture)
             for number, load in enumerate(loads):
                 for name in callers:

@@ -39,7 +39,7 @@ class Crowd:
     model: str
     token: str
     over: threading.Event = field(default_factory=threading.Event)
-    answers: Counter[str] = field(default_factory=Counter)
+    responses: Counter[str] = field(default_factory=Counter)
 
     def connect(self, received: int = 0) -> socket.socket:
         """A connection, which takes no more than about `received` bytes where that is given."""
@@ -89,26 +89,28 @@ class Crowd:
                 data = b""
             if data and number not in heads:
                 heads[number] = data[9:12]
-                self.answers[data[9:12].decode("latin-1")] += 1
+                self.responses[data[9:12].decode("latin-1")] += 1
             if not data or (heads.get(number, b"2") > b"300"):
                 if number not in heads:
-                    self.answers["ended"] += 1
+                    self.responses["ended"] += 1
                 links.pop(number).close()
                 heads.pop(number, None)
 
-    def asked(self, requests: list[bytes], *, workers: int = WORKERS, again: bool = False) -> None:
+    def send_all(
+        self, requests: list[bytes], *, workers: int = WORKERS, again: bool = False
+    ) -> None:
         """Ask as fast as answers come, over so many connections; a new one each time if `again`."""
 
-        def ask(own: Iterator[bytes]) -> None:
+        def send_own(own: Iterator[bytes]) -> None:
             link = None
             while not self.over.is_set():
                 try:
                     link = link or self.connect()
                     link.sendall(next(own))
-                    status, closed = _answer(link)
+                    status, closed = _response(link)
                 except OSError:
                     status, closed = "ended", True
-                self.answers[status] += 1
+                self.responses[status] += 1
                 if closed or again:
                     if link is not None:
                         link.close()
@@ -116,7 +118,7 @@ class Crowd:
 
         turns = [cycle(requests[k:] + requests[:k]) for k in range(len(requests))]
         threads = [
-            threading.Thread(target=ask, args=(turns[n % len(turns)],), daemon=True)
+            threading.Thread(target=send_own, args=(turns[n % len(turns)],), daemon=True)
             for n in range(workers)
         ]
         for thread in threads:
@@ -124,7 +126,7 @@ class Crowd:
         self.over.wait()
 
 
-def _answer(link: socket.socket) -> tuple[str, bool]:
+def _response(link: socket.socket) -> tuple[str, bool]:
     """The status of an answer that is read to its end, and whether the connection ends with it."""
     data = b""
     while b"\r\n\r\n" not in data:
@@ -172,7 +174,7 @@ def _uploads(crowd: Crowd) -> None:
     deep = b'{"lights":' + 100_000 * b"[" + 100_000 * b"]" + b"}"
     many = b'{"lights":[' + b",".join(250_000 * [b"[]"]) + b"]}"
     bodies = [crowd.request("POST /plans:validate", x) for x in (wrong, deep, many)]
-    crowd.asked([zeros, *bodies], workers=8)
+    crowd.send_all([zeros, *bodies], workers=8)
 
 
 def _renders(crowd: Crowd) -> None:
@@ -180,7 +182,7 @@ def _renders(crowd: Crowd) -> None:
     weights = {str(n): [1, 1, 1] for n in range(0, 60, 3)}
     view = json.dumps({"view": VIEW, "weights": weights}).encode()
     path = f"POST /view/models/{crowd.model}/indirect/view"
-    crowd.asked([crowd.request(path, view)], workers=8)
+    crowd.send_all([crowd.request(path, view)], workers=8)
 
 
 def _requests(crowd: Crowd) -> None:
@@ -195,14 +197,14 @@ def _requests(crowd: Crowd) -> None:
         "/openapi.json",
     ]
     plan = json.dumps({"projectors": []}).encode()
-    crowd.asked(
+    crowd.send_all(
         [*(crowd.request(f"GET {p}") for p in paths), crowd.request("POST /plans:validate", plan)]
     )
 
 
 def _arrivals(crowd: Crowd) -> None:
     """The same over a new connection each."""
-    crowd.asked([crowd.request("GET /health"), crowd.request("GET /captures")], again=True)
+    crowd.send_all([crowd.request("GET /health"), crowd.request("GET /captures")], again=True)
 
 
 def _replays(crowd: Crowd) -> None:
@@ -213,7 +215,7 @@ def _replays(crowd: Crowd) -> None:
 def _logins(crowd: Crowd) -> None:
     """Logins by tokens that there are not."""
     body = json.dumps({"token": "x" * 43}).encode()
-    crowd.asked([crowd.request("POST /login", body)], again=True)
+    crowd.send_all([crowd.request("POST /login", body)], again=True)
 
 
 LOADS: dict[str, Callable[[Crowd], None]] = {
@@ -240,7 +242,7 @@ def main() -> None:
     sys.stdin.read()
     crowd.over.set()
     time.sleep(0.3)
-    print(json.dumps(crowd.answers), flush=True)
+    print(json.dumps(crowd.responses), flush=True)
     os._exit(0)
 
 

@@ -49,20 +49,20 @@ def test_a_quick_run_leaves_what_the_cpu_does_and_says_what_is_not_here(tmp_path
     assert main(["backends", "--quick", "--jobs", "bsdf", "--out", str(tmp_path)]) == 0
     (job,) = json.loads((tmp_path / "backends.json").read_text())["jobs"].values()
     assert job[LLVM]["seconds"] > 0
-    told = (tmp_path / "backends.md").read_text()
-    assert f"{len(os.sched_getaffinity(0))} threads" in told
-    assert (CUDA in job) != (f"{CUDA}: not here" in told)
+    page = (tmp_path / "backends.md").read_text()
+    assert f"{len(os.sched_getaffinity(0))} threads" in page
+    assert (CUDA in job) != (f"{CUDA}: not here" in page)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", [LLVM, CUDA])
 def test_a_job_runs_in_a_process_of_its_own_whose_variant_it_is(variant, monkeypatch) -> None:
     monkeypatch.setenv(VARIANT, "mine")
-    assert done_by(variant, _tells).figures == {variant: 1}
+    assert done_by(variant, _reports).figures == {variant: 1}
     assert os.environ[VARIANT] == "mine"
 
 
-def _tells() -> Done:
+def _reports() -> Done:
     return Done(0, 0, np.zeros(0, np.float32), {os.environ[VARIANT]: 1})
 
 

@@ -74,7 +74,7 @@ class Bench:
         self.lamps: Any = None
         self.faults = Faults()
         self.pulses = 0
-        self.seen: list[str] = []
+        self.requests: list[str] = []
         self.link: Path | None = None
         self.peer: Any = None
 
@@ -86,7 +86,7 @@ class Bench:
         return self.faults.since(device, kind, self.pulses)
 
     def strikes(self, device: str, request: str) -> Fault | None:
-        self.seen.append(request)
+        self.requests.append(request)
         return self.faults.on_request(device, request, self.pulses)
 
     def plugged(self) -> bool:

@@ -25,23 +25,23 @@ def client(bench):
 
 
 def test_pymodbustcp_reads_and_writes_every_table(client):
-    ask, one = client
-    assert ask.read_input_registers(0, 5) == [0, 0, 200, 0x4853, 0]
-    assert ask.write_single_register(1000, 3)
+    run_client, one = client
+    assert run_client.read_input_registers(0, 5) == [0, 0, 200, 0x4853, 0]
+    assert run_client.write_single_register(1000, 3)
     assert one.lit() == [2]
-    assert ask.read_coils(0, 5) == [False, False, True, False, False]
-    assert ask.write_multiple_coils(0, [True, True, False])
-    assert ask.write_single_coil(199, True)
+    assert run_client.read_coils(0, 5) == [False, False, True, False, False]
+    assert run_client.write_multiple_coils(0, [True, True, False])
+    assert run_client.write_single_coil(199, True)
     assert one.lit() == [0, 1, 199]
-    assert ask.read_holding_registers(1000, 4) == [65534, 0, 2000, 0]
-    assert ask.write_multiple_registers(0, [32768] * 123)
-    assert ask.read_holding_registers(121, 3) == [32768, 32768, 65535]
-    assert ask.write_multiple_registers(2000, [8, 65535])
-    assert ask.write_single_register(1003, 1)
+    assert run_client.read_holding_registers(1000, 4) == [65534, 0, 2000, 0]
+    assert run_client.write_multiple_registers(0, [32768] * 123)
+    assert run_client.read_holding_registers(121, 3) == [32768, 32768, 65535]
+    assert run_client.write_multiple_registers(2000, [8, 65535])
+    assert run_client.write_single_register(1003, 1)
     one.lamps.gate(True)
     assert one.lit() == [7]
     one.lamps.gate(False)
-    assert ask.read_input_registers(4, 1) == [1]
+    assert run_client.read_input_registers(4, 1) == [1]
 
 
 @pytest.mark.parametrize(
@@ -58,9 +58,9 @@ def test_pymodbustcp_reads_and_writes_every_table(client):
     ],
 )
 def test_pymodbustcp_understands_the_exceptions(client, call, exception):
-    ask, one = client
-    assert not call(ask)
-    assert ask.last_except == exception
+    run_client, one = client
+    assert not call(run_client)
+    assert run_client.last_except == exception
     assert one.lit() == []
 
 
@@ -74,15 +74,15 @@ def mbpoll(request, bench):
     line = ("-m", "tcp", "-p", str(one.driver.config.port)) if tcp else RTU_LINE
     place = "127.0.0.1" if tcp else one.driver.config.port
 
-    def ask(*arguments, values=()):
+    def run_client(*arguments, values=()):
         command = ["mbpoll", *line, "-0", "-1", "-o", "2", *arguments, place, *values]
         done = subprocess.run(command, capture_output=True, text=True, timeout=20)
         said = done.stdout + done.stderr
         read = {int(a): int(v) for a, v in re.findall(r"^\[(\d+)\]:\s+(\d+)", said, re.MULTILINE)}
         return read, said
 
-    ask.bank = one
-    return ask
+    run_client.bank = one
+    return run_client
 
 
 def test_mbpoll_reads(mbpoll):

@@ -39,7 +39,7 @@ def gated(request, bench):
     return one
 
 
-def test_it_lights_exactly_what_it_is_told(any_bank):
+def test_the_bank_lights_exactly_the_commanded_lamps(any_bank):
     driver = any_bank.driver
     assert driver.count == 200
     driver.off()
@@ -129,14 +129,14 @@ def test_an_armed_sequence_is_dark_refuses_the_selector_and_is_left_by_off(bank)
 def test_the_gate_steps_a_sequence(gated):
     entries = [("none", 1.0), ("all", 0.25), (7, 1.0), (199, 0.5)]
     gated.driver.load_sequence(entries)
-    seen = []
+    recorded = []
     for _ in entries:
         gated.lamps.gate(True)
-        seen.append((gated.lit(), max(gated.powers())))
+        recorded.append((gated.lit(), max(gated.powers())))
         gated.lamps.gate(False)
         assert gated.lit() == []
-    assert [lit for lit, _ in seen] == [[], list(range(200)), [7], [199]]
-    np.testing.assert_allclose([p for _, p in seen], [0, 0.25, 1, 0.5], atol=0.5 / 255)
+    assert [lit for lit, _ in recorded] == [[], list(range(200)), [7], [199]]
+    np.testing.assert_allclose([p for _, p in recorded], [0, 0.25, 1, 0.5], atol=0.5 / 255)
     assert gated.driver.position() == 4
     gated.lamps.gate(True)
     assert gated.lit() == []
@@ -197,7 +197,7 @@ def test_a_bank_that_cannot_guarantee_a_blackout_is_refused(bench, kind):
     assert "lit lamps stay lit" in text
     assert "cannot confirm that the lamps are off" in text
     assert "accept_unverified_blackout = true" in text
-    assert one.seen == []
+    assert one.requests == []
 
 
 def test_a_bank_of_another_size_is_refused(bench):
@@ -217,7 +217,7 @@ def test_another_device_is_refused(bench):
     driver.close()
 
 
-def test_nobody_there_is_told_with_the_reason():
+def test_missing_bank_is_reported_with_the_reason():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     driver = ModbusLightBank(ModbusTcpConfig(port=port, timeout_s=0.2), 3)
@@ -239,7 +239,7 @@ def test_more_lamps_than_a_universe_has_channels_are_refused(first, lamps):
 
 
 @pytest.mark.parametrize(
-    ("registers", "lamps", "told"),
+    ("registers", "lamps", "message"),
     [
         ({}, 1001, "selector overlaps levels at 1000"),
         ({"levels": 900, "owner": "none"}, 331, "selector overlaps levels at 1000"),
@@ -249,10 +249,10 @@ def test_more_lamps_than_a_universe_has_channels_are_refused(first, lamps):
         ({"levels": 10_191}, 331, "table overlaps levels at 10191"),  # the last of 4096 entries
     ],
 )
-def test_registers_that_lie_over_each_other_are_refused(registers, lamps, told):
+def test_overlapping_registers_are_refused(registers, lamps, message):
     """By the wire's page, 65535 at the selector puts all lamps on: as a level it is full."""
     config = ModbusTcpConfig.model_validate({"registers": registers})
-    with pytest.raises(RigError, match=told):
+    with pytest.raises(RigError, match=message):
         ModbusLightBank(config, lamps)
 
 
@@ -292,7 +292,7 @@ def test_an_owner_without_a_name_is_one(bank):
     assert bank.driver.claim(7, "left:123") == "a service that gave no name (300)"
 
 
-def test_a_bank_that_was_started_anew_or_is_another_s_is_told_with_the_next_heartbeat(gated):
+def test_restarted_or_taken_over_bank_is_reported_at_the_next_heartbeat(gated):
     driver, lamps = gated.driver, gated.lamps
     driver.heartbeat()  # nobody's as yet
     assert driver.claim(7, "left:123") is None

@@ -49,7 +49,7 @@ def test_an_echo_and_the_line_s_noise_are_dropped(bench, wire, adapter):
     assert one.lit() == []
 
 
-def test_an_echo_without_a_bank_is_no_answer(bench):
+def test_an_echo_without_a_bank_is_no_reply(bench):
     one = bench(RTU, Fault("lights", "hang", 0), connect=False)
     one.peer.stand_behind(ECHO)
     calls: list[Callable[[], object]] = [
@@ -107,7 +107,7 @@ def test_a_line_that_echoes_no_more_is_learnt_anew(bench):
 
 
 @pytest.mark.parametrize("where", ["before", "after"])
-def test_a_line_feed_around_an_answer_is_told_and_is_none_by_itself(bench, where):
+def test_line_feed_around_a_reply_is_reported_and_alone_is_no_reply(bench, where):
     one = bench(RTU)
     one.driver.select(5)
     one.peer.stand_behind(Adapter(**{where: b"\n"}))
@@ -120,10 +120,10 @@ def test_a_line_feed_around_an_answer_is_told_and_is_none_by_itself(bench, where
     assert one.lit() == [7]
 
 
-def test_a_line_feed_alone_is_no_answer(bench):
+def test_a_line_feed_alone_is_no_reply(bench):
     one = bench(RTU)
     send = one.peer._terminal.send
-    one.peer._terminal.send = lambda _answer: send(b"\n")
+    one.peer._terminal.send = lambda _reply: send(b"\n")
     with pytest.raises(DeviceTimeout, match=r"lamp 5 on: .*received no reply in 1 bytes: 0a"):
         one.driver.select(5)
     one.peer._terminal.send = send
@@ -143,7 +143,7 @@ def test_a_widget_s_line_that_echoes(bench, adapter):
     assert one.lit() == []
 
 
-def test_an_echo_without_a_widget_is_no_answer(bench):
+def test_an_echo_without_a_widget_is_no_reply(bench):
     one = bench(DMX, Fault("lights", "hang", 0), connect=False)
     one.peer.stand_behind(ECHO)
     for call in (one.driver.off, one.driver.connect, one.driver.all_on):
@@ -204,7 +204,7 @@ CHANGES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_modbus_tcp_answer_that_disagrees_with_its_request_is_none(bench, change):
+def test_modbus_tcp_reply_that_mismatches_its_request_is_rejected(bench, change):
     """F22: what was expected and received is named, and the bank's word is not taken."""
     one = bench(TCP, connect=False)
     make, text = CHANGES[change]
@@ -250,7 +250,7 @@ def test_a_place_that_sends_back_what_it_gets_is_no_bank(slack):
         listener.shutdown(socket.SHUT_RDWR)
 
 
-def test_an_answer_of_another_unit_of_the_line_is_none(bench):
+def test_reply_of_another_unit_on_the_line_is_rejected(bench):
     one = bench(RTU)
     send = one.peer._terminal.send
 

@@ -66,7 +66,7 @@ def board() -> Board:
 @pytest.fixture(scope="session")
 def noisy_sightings(true_rig: Rig, board: Board) -> dict[str, dict[str, Sighting]]:
     """Where the cameras find the corners, in pictures with the sensor's noise."""
-    seen: dict[str, dict[str, Sighting]] = {c.name: {} for c in true_rig.cameras}
+    sightings: dict[str, dict[str, Sighting]] = {c.name: {} for c in true_rig.cameras}
     for pose in POSES:
         responder = PropResponder(true_rig, board_pose(pose, board), samples=2)
         for k, camera in enumerate(true_rig.cameras):
@@ -75,8 +75,8 @@ def noisy_sightings(true_rig: Rig, board: Board) -> dict[str, dict[str, Sighting
             image[response.pixels] = response.images[0]
             counts = Sensor().expose(image.reshape(HEIGHT, WIDTH, 3), 0.02, (pose, k))
             grey = (counts.astype(float) - Sensor().black).mean(axis=-1)
-            seen[camera.name][f"pose {pose}"] = board.find(grey)
-    return seen
+            sightings[camera.name][f"pose {pose}"] = board.find(grey)
+    return sightings
 
 
 Shoot = Callable[..., Capture]

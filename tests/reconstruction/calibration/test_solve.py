@@ -50,7 +50,7 @@ def test_captures_become_a_rig_file_that_is_near_the_truth(
 
 
 @pytest.mark.slow
-def test_a_square_of_another_length_than_told_is_warned_of(
+def test_wrong_square_length_gives_a_warning(
     nominal_rig: Rig, board_captures: list[Capture]
 ) -> None:
     """Squares of 27 mm that are taken for 30 mm make every length a ninth too large."""
@@ -135,7 +135,7 @@ def test_a_light_of_another_colour_is_off_by_its_channels(true_rig: Rig) -> None
     assert max(x["intensity"] for x in errors.values()) == 0
 
 
-def test_a_device_that_the_truth_lacks_is_told_before_the_work(
+def test_device_missing_from_the_truth_is_reported_before_the_work(
     tmp_path: Path,
     true_rig: Rig,
     board_captures: list[Capture],

@@ -24,9 +24,9 @@ def exact(camera: Camera, prop: BoardProp, noise: float = 0.03, seed: int = 0) -
     world = prop.board.corners @ prop.rotation.T + prop.translation
     pixels, _ = camera.project(world)
     rng = np.random.default_rng(seed)
-    seen = camera.inside(pixels)
+    observed = camera.inside(pixels)
     pixels = pixels + noise * rng.standard_normal(pixels.shape)
-    return Sighting(np.flatnonzero(seen), pixels[seen])
+    return Sighting(np.flatnonzero(observed), pixels[observed])
 
 
 def level_board(board: Board, shift: NDArray[np.float64]) -> BoardProp:
@@ -100,54 +100,54 @@ def test_a_kept_lens_keeps_its_skew(board: Board) -> None:
     camera = Camera("front", 640, 480, K, np.eye(3), np.array([0, 0, 0.9]), (-0.2, 0, 0, 0, 0))
     turn = cv2.Rodrigues(np.array([0.4, -0.3, 0.2]))[0]
     points = (board.corners - (*board.size / 2, 0)) @ turn.T
-    seen = {"only": Sighting(np.arange(len(points)), camera.project(points)[0])}
-    found = calibrate_cameras([camera], board, {"front": seen}, keep_lens=True)
+    observed = {"only": Sighting(np.arange(len(points)), camera.project(points)[0])}
+    found = calibrate_cameras([camera], board, {"front": observed}, keep_lens=True)
     np.testing.assert_array_equal(found.cameras[0].K, K)
     to_world = found.board_to_world["only"]
     again, _ = found.cameras[0].project(to_world(board.corners))
-    np.testing.assert_allclose(again, seen["only"].pixels, atol=1e-9)
+    np.testing.assert_allclose(again, observed["only"].pixels, atol=1e-9)
     np.testing.assert_allclose(found.cameras[0].R @ to_world.rotation, turn, atol=1e-9)
 
 
 def test_parallel_poses_leave_the_lens_open(board: Board) -> None:
     camera = Camera.look_at("front", 320, 256, (0.95, 0, 0), (0, 0, 0), 24.0)
     shifts = np.random.default_rng(2).uniform(-0.04, 0.04, (4, 3)) * (0, 1, 1)
-    seen = {f"{k}": exact(camera, level_board(board, s), seed=k) for k, s in enumerate(shifts)}
+    observed = {f"{k}": exact(camera, level_board(board, s), seed=k) for k, s in enumerate(shifts)}
     with pytest.raises(CalibrationError, match="front: 4 poses of the board do not determine"):
-        calibrate_cameras([camera], board, {"front": seen})
+        calibrate_cameras([camera], board, {"front": observed})
 
 
 @pytest.mark.parametrize("way", [(0, 0, 0), (0.02, 0, 0), (0, 0, 0.1)], ids=["same", "side", "far"])
-def test_what_parallel_poses_leave_open_is_not_told_in_per_cent(
+def test_parallel_poses_raise_an_error_for_the_focal_length(
     board: Board, way: tuple[float, float, float]
 ) -> None:
     K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
     camera = Camera("front", 640, 480, K, np.eye(3), np.array([0, 0, 0.6]))
     flat = board.corners - (*board.size / 2, 0)
-    seen = {
+    observed = {
         f"{k}": Sighting(np.arange(len(flat)), camera.project(flat + k * np.array(way))[0])
         for k in range(3)
     }
     with pytest.raises(CalibrationError, match="focal length is not determined: tilt"):
-        calibrate_cameras([camera], board, {"front": seen})
+        calibrate_cameras([camera], board, {"front": observed})
 
 
 def test_groups_of_cameras_without_a_common_pose_are_named(board: Board) -> None:
     front = Camera.look_at("front", 320, 256, (0.95, 0, 0), (0, 0, 0), 24.0)
     back = Camera.look_at("back", 320, 256, (-0.95, 0, 0), (0, 0, 0), 24.0)
-    seen = {
+    observed = {
         "front": {f"f{n}": exact(front, board_pose(n, board), seed=n) for n in (0, 1, 15, 16, 17)},
         "back": {f"b{n}": exact(back, board_pose(n, board), seed=n) for n in (7, 8, 9, 23, 24)},
     }
     with pytest.raises(CalibrationError, match=r"connects \['back'\] to \['front'\]"):
-        calibrate_cameras([front, back], board, seen)
+        calibrate_cameras([front, back], board, observed)
 
 
 def test_a_camera_listed_twice_is_found_twice_in_one_place(board: Board) -> None:
     one = Camera.look_at("one", 320, 256, (0.95, 0, 0), (0, 0, 0), 24.0)
     two = replace(one, name="two")
-    seen = {f"{n}": exact(one, board_pose(n, board), seed=n) for n in (0, 1, 15, 16, 17, 31)}
-    found = calibrate_cameras([one, two], board, {"one": seen, "two": seen})
+    observed = {f"{n}": exact(one, board_pose(n, board), seed=n) for n in (0, 1, 15, 16, 17, 31)}
+    found = calibrate_cameras([one, two], board, {"one": observed, "two": observed})
     assert np.linalg.norm(found.cameras[0].center - found.cameras[1].center) < 1e-5
 
 

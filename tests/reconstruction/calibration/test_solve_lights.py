@@ -58,7 +58,7 @@ def test_shading_corrects_where_outlines_put_the_sphere(
 
 
 @pytest.mark.parametrize("radius", [0.05, 0.059, 0.06, 0.061, 0.07])
-def test_outlines_of_another_radius_than_told_are_warned_of(
+def test_wrong_sphere_radius_gives_a_warning(
     true_rig: Rig, diffuse_captures: list[Capture], radius: float
 ) -> None:
     """The spheres' radius is 60 mm: of 50, the lamps would be three times as far as they are."""
@@ -66,8 +66,8 @@ def test_outlines_of_another_radius_than_told_are_warned_of(
     gather_shading(diffuse_captures, true_rig.cameras, radius, 0.8, ["lamp_0"], warnings.append)
     assert len(warnings) == (0 if radius == 0.06 else 2)
     for text, capture in zip(warnings, diffuse_captures, strict=False):
-        seen = float(text.split("a radius of ")[1].split(" mm")[0])
-        assert seen == pytest.approx(60, abs=1.0)
+        observed = float(text.split("a radius of ")[1].split(" mm")[0])
+        assert observed == pytest.approx(60, abs=1.0)
         assert f"{capture.path}: " in text
         assert f"expected {1e3 * radius:g} mm" in text
     warnings.clear()  # one camera tells size or distance
@@ -95,7 +95,7 @@ def test_a_mirror_alone_says_where_lights_are_when_its_places_are_wide_apart(
 ) -> None:
     rng = np.random.default_rng(0)
     places = np.array([(0.0, -0.15, 0.1), (0.05, 0.15, 0.1), (0.0, 0.15, -0.1), (0, -0.15, -0.1)])
-    seen = []
+    observed = []
     for k, place in enumerate(places):
         for camera in true_rig.cameras:
             for light in true_rig.lights:
@@ -106,16 +106,16 @@ def test_a_mirror_alone_says_where_lights_are_when_its_places_are_wide_apart(
                 spot = find_highlight(image, np.zeros_like(image, bool))
                 assert spot is not None
                 spot = replace(spot, pixel=pixel, deviation=0.05)
-                seen.append(Glint(light.name, camera, k, spot))
+                observed.append(Glint(light.name, camera, k, spot))
     nominal = {x.name: x for x in nominal_rig.lights}
-    lights, _, _ = mirrored_lights(nominal, seen, 0.05, {})
+    lights, _, _ = mirrored_lights(nominal, observed, 0.05, {})
     for true in true_rig.lights:
         assert np.linalg.norm(lights[true.name].light.position - true.position) < 0.01 * 1.2
         assert lights[true.name].intensity_deviation is None
 
 
 @pytest.mark.slow
-def test_one_place_seen_by_one_pixel_leaves_the_distance_open(
+def test_one_place_in_one_pixel_leaves_the_distance_undetermined(
     nominal_rig: Rig, glints: list[Glint]
 ) -> None:
     one = [g for g in glints if g.sphere == 0]
@@ -132,7 +132,7 @@ def test_cameras_in_one_place_cannot_say_where_a_mirror_is(
         mirrored_lights({x.name: x for x in nominal_rig.lights}, twice, 0.05, {})
 
 
-def test_a_saturated_highlight_is_told_and_weighs_less() -> None:
+def test_a_saturated_highlight_gives_a_warning_and_weighs_less() -> None:
     image = np.zeros((40, 40))
     image[18:23, 10:15] = 4.0
     spot = find_highlight(image, image >= 4.0)
@@ -144,7 +144,7 @@ def test_a_saturated_highlight_is_told_and_weighs_less() -> None:
     assert spot.deviation > 5 * sharp.deviation
 
 
-def test_a_light_behind_the_sphere_is_an_error_that_says_so(
+def test_a_light_behind_the_sphere_raises_an_error(
     true_rig: Rig, nominal_rig: Rig, shadings: dict[str, Shading]
 ) -> None:
     dark = shadings["lamp_0"]

@@ -168,18 +168,18 @@ def test_brackets_of_a_light_are_merged_without_what_is_saturated(tmp_path):
     true = np.array([1.0, 5.0, 20.0, 200.0])
     for step in steps:
         full = 2.0 * 0.08 / step.exposure
-        seen = np.minimum(true + step.exposure, full)
-        image = np.broadcast_to(np.repeat(seen, 2)[None, :, None], (6, 8, 3))
+        observed = np.minimum(true + step.exposure, full)
+        image = np.broadcast_to(np.repeat(observed, 2)[None, :, None], (6, 8, 3))
         writer.write_frame(step, "cam_0", image.astype(np.float32), full_scale=full)
     writer.close()
     response, saturated = Capture(tmp_path / "c").light("light_2", "cam_0")
-    seen = [
+    observed = [
         (1 + np.average(exposures, weights=exposures)),
         (5 + np.average(exposures[:2], weights=exposures[:2])),
         20.002,
         80.0,
     ]
-    np.testing.assert_allclose(response[0, ::2, 0], 2 * np.array(seen), rtol=1e-5)
+    np.testing.assert_allclose(response[0, ::2, 0], 2 * np.array(observed), rtol=1e-5)
     np.testing.assert_array_equal(saturated[0, ::2], [False, False, False, True])
 
 

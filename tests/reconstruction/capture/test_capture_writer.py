@@ -281,7 +281,7 @@ def test_a_reader_finds_a_frame_that_is_compressed_under_its_hands(path):
         stale.frame(step, "cam_1")
 
 
-def test_what_a_crash_leaves_between_journal_and_removal_is_told_and_taken_away(path):
+def test_leftovers_of_a_crash_before_removal_are_reported_and_removed(path):
     old = path / "frames/00001/cam_0.exr"
     before = old.read_bytes()
     compress(path)
@@ -332,7 +332,7 @@ def test_what_is_journalled_was_flushed_before_however_many_frames_share_a_flush
     """One flush of the whole disk for six files, or one a file where pages may be in a cache."""
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
     wrote: Any = durable.write_pages
-    told: list[str] = []
+    messages: list[str] = []
     # As a file system says that has direct input and output, or has none.
     monkeypatch.setattr(capture_writer, "write_pages", lambda p, d: (wrote(p, d), direct)[1])
     records = [writer.store_frame(STEPS[i], c, image(STEPS[i], c)) for i, c in EVERY]
@@ -340,19 +340,19 @@ def test_what_is_journalled_was_flushed_before_however_many_frames_share_a_flush
     rename, append = Path.replace, durable.append_whole
 
     def fsync(handle: int) -> None:
-        told.append(Path(f"/proc/self/fd/{handle}").resolve().name)
+        messages.append(Path(f"/proc/self/fd/{handle}").resolve().name)
         each(handle)
 
     def all_of_it(disk: durable.FileSystem) -> None:
-        told.append("disk")
+        messages.append("disk")
         whole(disk)
 
     def renamed(old: Path, new: Path) -> Path:
-        told.append(new.name)
+        messages.append(new.name)
         return rename(old, new)
 
     def appended(file: Any, data: bytes) -> None:
-        told.append("line")
+        messages.append("line")
         append(file, data)
 
     monkeypatch.setattr(os, "fsync", fsync)
@@ -362,12 +362,12 @@ def test_what_is_journalled_was_flushed_before_however_many_frames_share_a_flush
     writer.commit(records)
     names = [f"{camera}.exr" for _, camera in EVERY]
     if direct:
-        assert told == [*names, "disk", "line", "journal.jsonl"]
+        assert messages == [*names, "disk", "line", "journal.jsonl"]
     else:
         files = [x for name in names for x in (f".part-{name}", name)]
-        assert told[:12] == files
-        assert sorted(told[12:-2]) == ["00000", "00001", "00002", "frames"]
-        assert told[-2:] == ["line", "journal.jsonl"]
+        assert messages[:12] == files
+        assert sorted(messages[12:-2]) == ["00000", "00001", "00002", "frames"]
+        assert messages[-2:] == ["line", "journal.jsonl"]
     writer.finish("completed")
     assert verify(tmp_path / "c") == []
 

@@ -84,7 +84,7 @@ def write_settings(root, circles, more=""):
     return circles
 
 
-def told(root):
+def circle_settings(root):
     return {
         line.partition(" = ")[0]: json.loads(line.partition(" = ")[2])
         for line in (root / "import.toml").read_text().splitlines()
@@ -114,7 +114,7 @@ def test_a_light_that_something_stands_before_changes_nothing(folder, tmp_path):
     assert image.sum() == pytest.approx(truth.sum(), rel=0.02)
 
 
-def test_lights_that_disagree_and_a_coloured_ball_are_told(folder, tmp_path):
+def test_contradicting_lights_and_a_coloured_ball_give_warnings(folder, tmp_path):
     for k, light in enumerate(LIGHTS):
         for name in EYES:
             path = folder / f"images/{name}/{light}.png"
@@ -136,14 +136,14 @@ def test_lights_that_disagree_and_a_coloured_ball_are_told(folder, tmp_path):
         ({}, "scale = 2.0", "remove `units` and `scale`"),
     ],
 )
-def test_what_does_not_fit_is_told(folder, tmp_path, change, more, words):
-    circles = {k: v for k, v in {**told(folder), **change}.items() if v is not None}
+def test_an_invalid_grey_ball_raises_an_error(folder, tmp_path, change, more, words):
+    circles = {k: v for k, v in {**circle_settings(folder), **change}.items() if v is not None}
     write_settings(folder, circles, more)
     with pytest.raises(ImportProblem, match=f"grey_ball.*{words}"):
         import_folder(folder, tmp_path / "out")
 
 
-def test_a_ball_that_no_light_reaches_is_told(folder, tmp_path):
+def test_an_unlit_ball_raises_an_error(folder, tmp_path):
     for path in folder.glob("images/*/*.png"):
         assert cv2.imwrite(str(path), np.zeros((SIZE, SIZE, 3), np.uint16))
     with pytest.raises(ImportProblem, match="no frame shows the lit side of the ball"):

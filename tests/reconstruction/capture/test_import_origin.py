@@ -96,7 +96,7 @@ def test_a_subject_near_the_origin_stays_where_it_is(tmp_path: Path) -> None:
 
 def test_lights_that_aim_and_other_lenses_are_moved_alike(tmp_path: Path) -> None:
     turn = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0.0]])
-    seen = []
+    observed = []
     for name, at in (("still", np.zeros(3)), ("away", AWAY)):
         stage = [
             LensModelCamera(c.name, 8, 6, c.K, c.R, c.t, lens=LensModel("fisheye", [0.01, 0, 0, 0]))
@@ -107,8 +107,8 @@ def test_lights_that_aim_and_other_lenses_are_moved_alike(tmp_path: Path) -> Non
             for i, p in enumerate(LIGHTS)
         ]
         geometry = Geometry({c.name: c for c in stage}, lights)
-        seen.append(Import.of(folder(tmp_path / name, at.tolist()), geometry))
-    still, away = seen
+        observed.append(Import.of(folder(tmp_path / name, at.tolist()), geometry))
+    still, away = observed
     for a, b in zip(still.rig.lights, away.rig.lights, strict=True):
         point = [0.02, 0.01, -0.03]
         np.testing.assert_allclose(b.intensity_towards(point), a.intensity_towards(point))

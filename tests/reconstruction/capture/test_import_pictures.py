@@ -147,7 +147,7 @@ def test_floats_above_1_are_light_and_not_saturated(tmp_path):
         assert not full.saturated[bright < 9.8].any()
 
 
-def test_an_exr_of_layers_is_told_from_a_broken_one(tmp_path):
+def test_layered_exr_is_distinguished_from_a_broken_one(tmp_path):
     """Blender's multilayer files have no plain R, G and B: copying them anew was no help."""
     path, layer = tmp_path / "a.exr", np.ones((SIZE, SIZE), np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -191,9 +191,9 @@ def test_a_camera_whose_folder_is_a_link_has_its_pictures(folder, tmp_path):
     (folder / "images/right").symlink_to(disk / "right", target_is_directory=True)
     (disk / "right/back").symlink_to(folder, target_is_directory=True)
     (folder / "another").symlink_to(folder / "images", target_is_directory=True)
-    seen = Import.of(folder)
-    assert seen.missing == []
-    assert seen.counts()["frames"] == len(CAMERAS) * len(LIGHTS)
+    observed = Import.of(folder)
+    assert observed.missing == []
+    assert observed.counts()["frames"] == len(CAMERAS) * len(LIGHTS)
 
 
 HALF_TURN = np.frombuffer(
@@ -278,7 +278,7 @@ def test_seconds_that_the_files_say(folder, tmp_path, suffix):
     assert np.abs(image - 8 * light_of(0, 1)).max() < (3 if suffix == "jpg" else 1) * count
 
 
-def test_shots_of_another_sensitivity_are_told(folder):
+def test_shots_of_another_sensitivity_give_a_warning(folder):
     everywhere(lambda c, n, x: save_as_shot(folder / f"images/{c}/{n}.png", x, 0.1, 100 * (n + 1)))
     settings(folder, 'exposure = "file"\n')
     (note,) = [n for n in Import.of(folder).found.notes if "ISO" in n]
@@ -335,7 +335,7 @@ def test_missing_frames_are_values(folder, tmp_path):
     assert said in capture.plan["import"]["notes"]
 
 
-def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
+def test_clean_plate_separates_the_subject_and_is_subtracted(folder, tmp_path):
     """A wall at 3 % and a subject before it, whose shadow falls on the wall under one light."""
     rng = np.random.default_rng(0)
     inside = np.zeros((SIZE, SIZE), bool)
@@ -361,7 +361,7 @@ def test_a_clean_plate_tells_the_subject_and_is_taken_off(folder, tmp_path):
     np.testing.assert_allclose(image[inside], 0.6, atol=2e-3)
 
 
-def test_clean_plates_that_match_no_frame_are_told(folder, tmp_path):
+def test_clean_plates_that_match_no_frame_give_a_warning(folder, tmp_path):
     """Plates without a light, where no frame has all lights on; one camera's are as they should."""
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
     save(folder / "plate/right.png", light_of(1, 0), np.uint16)
@@ -394,7 +394,7 @@ def test_clean_plates_that_show_the_subject_are_refused(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("asked", "says"),
+    ("requested", "says"),
     [
         (["--unit", "mm"], "up and camera axes need --cameras; cameras.json"),
         (["--up", "y"], "up and camera axes need --cameras; cameras.json"),
@@ -406,9 +406,9 @@ def test_clean_plates_that_show_the_subject_are_refused(folder, tmp_path):
         ),
     ],
 )
-def test_options_that_nothing_would_read_are_refused(folder, tmp_path, capsys, asked, says):
+def test_options_without_effect_are_refused(folder, tmp_path, capsys, requested, says):
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
-    assert main(["import", str(folder), "--out", str(tmp_path / "out"), *asked]) != 0
+    assert main(["import", str(folder), "--out", str(tmp_path / "out"), *requested]) != 0
     assert says in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -575,7 +575,7 @@ def test_wrong_settings(folder, tmp_path, text, says):
         import_folder(folder, tmp_path / "out")
 
 
-def test_what_was_understood_is_said_and_drawn(folder, tmp_path):
+def test_interpreted_settings_are_reported_and_drawn(folder, tmp_path):
     everywhere(lambda c, n, x: save(folder / "images" / c / f"{n + 1:04d}.png", x, np.uint16))
     save(folder / "images/notes/x.png", light_of(0, 0), np.uint16)
     settings(folder, "first_light = 1")

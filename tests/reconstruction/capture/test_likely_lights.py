@@ -59,7 +59,7 @@ def written(folder: Path, suffix: str, lights: int = 3, dark: tuple[str, ...] = 
     return folder
 
 
-def test_an_import_makes_lights_as_strong_and_says_so(tmp_path: Path) -> None:
+def test_import_assumes_equal_light_intensities_and_warns(tmp_path: Path) -> None:
     """A matte plane sends ρ/(4 π) of such a light."""
     capture = import_folder(written(tmp_path / "folder", ".png"), tmp_path / "out")
     strength = Rig.load(capture.path / "rig.json").lights[0].intensity[0]
@@ -75,7 +75,7 @@ def test_floats_are_radiance_and_their_lights_stay(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dark", ["left", "right"])
-def test_of_many_frames_those_of_all_cameras_are_looked_at(tmp_path: Path, dark: str) -> None:
+def test_sampled_frames_cover_all_cameras(tmp_path: Path, dark: str) -> None:
     """Every fourth frame is always of the first of two cameras."""
     folder = written(tmp_path / "folder", ".png", lights=96, dark=(dark,))
     capture = import_folder(folder, tmp_path / "out")

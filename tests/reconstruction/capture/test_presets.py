@@ -97,10 +97,10 @@ def test_faceolat(first: int, tmp_path: Path) -> None:
     path = next(f.path for f in take.frames if f.number == 42 and f.camera == "Cam01")
     assert path.name == "ID20001.000042.png"
     assert any("Cam03: no images" in n for n in take.geometry.notes)
-    seen = Import.of(tmp_path / "out", take.geometry, *understood(take))
-    assert seen.missing == []
-    assert [s.light for s in seen.found.steps[1:3]] == [f"light_{k:03d}" for k in ORDER[:2]]
-    assert [(c.width, c.height) for c in seen.rig.cameras] == [(2, 4), (2, 4)]
+    observed = Import.of(tmp_path / "out", take.geometry, *understood(take))
+    assert observed.missing == []
+    assert [s.light for s in observed.found.steps[1:3]] == [f"light_{k:03d}" for k in ORDER[:2]]
+    assert [(c.width, c.height) for c in observed.rig.cameras] == [(2, 4), (2, 4)]
     # the world: metres, z up, lights and cameras about the same place
     place = np.linalg.inv(TO_Y_UP) @ SUBJECT
     found = np.array([light.position for light in take.geometry.lights])
@@ -184,12 +184,19 @@ def test_the_command_imports_a_take_of_avif(tmp_path: Path, capsys: pytest.Captu
         picture[4:12, 2:6] = cv2.imread(str(path))[0, 0]
         cv2.imwrite(str(path.with_suffix(".avif")), picture, [cv2.IMWRITE_AVIF_QUALITY, 100])
         path.unlink()
-    asked = ["--preset", "faceolat", "--cameras", str(files.cameras), "--lights", str(files.lights)]
+    arguments = [
+        "--preset",
+        "faceolat",
+        "--cameras",
+        str(files.cameras),
+        "--lights",
+        str(files.lights),
+    ]
     out = tmp_path / "capture"
-    assert main(["import", str(files.folder), *asked, "--out", str(out), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["frames"] == 349
-    assert any("fully lit in the frames 0, 20, …" in n for n in told["notes"])
+    assert main(["import", str(files.folder), *arguments, "--out", str(out), "--json"]) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert output["frames"] == 349
+    assert any("fully lit in the frames 0, 20, …" in n for n in output["notes"])
     capture = Capture(out)
     assert len(capture.of_kind("tracking")) == len(AT_0)
     share = capture.frame(capture.of_kind("tracking")[0], "Cam01")[8, 4]

@@ -132,15 +132,15 @@ def test_block_means_are_what_the_reduced_camera_sees(lens: list[float], by: int
         Camera.look_at("c", 97, 83, (0, -1, 0), (0, 0, 0), 30.0), distortion=lens, filter_sigma=0.5
     )
 
-    def slope(device: Camera) -> np.ndarray:
+    def gradient(device: Camera) -> np.ndarray:
         x, y = np.meshgrid(np.arange(device.width), np.arange(device.height))
         rays = device.rays(np.stack([x, y], axis=-1))
         return np.stack([rays[..., 0] / rays[..., 1], rays[..., 2] / rays[..., 1]], axis=-1)
 
     small = camera.reduced(by)
     assert (small.width, small.height) == (97 // by, 83 // by)
-    seen = block_means(slope(camera), by)
-    assert np.abs(seen - slope(small)).max() < 0.02 * 2 * np.tan(np.radians(15)) / 97 * by
+    observed = block_means(gradient(camera), by)
+    assert np.abs(observed - gradient(small)).max() < 0.02 * 2 * np.tan(np.radians(15)) / 97 * by
     # a Gaussian of 0.5 pixels and a block of n pixels have the variance of both
     assert small.filter_sigma * by == pytest.approx(np.sqrt(0.25 + (by**2 - 1) / 12))
     assert camera.reduced(1) is camera

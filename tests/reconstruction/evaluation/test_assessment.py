@@ -148,7 +148,7 @@ def test_strands_that_reach_the_scalp_with_root_or_tip() -> None:
     assert root_figures(up, true, head)["pred"]["rooted"] == 0.5
 
 
-def test_input_that_looks_wrong_is_said() -> None:
+def test_suspicious_input_gives_a_warning() -> None:
     assert input_warnings(row(), row()) == []
     millimetres = Strands(row().points * np.float32(1e3), row().offsets)
     assert "span 128 m" in input_warnings(millimetres, row())[0]

@@ -165,19 +165,19 @@ def test_smooth_field_falls_from_the_crown_of_a_dome() -> None:
     center = pieces.points.reshape(-1, 2, 3).mean(axis=1) - 0.039
     out = center / np.linalg.norm(center, axis=1, keepdims=True)
     down = np.array([0, 0, -1]) + out[:, 2:] * out
-    slope = np.linalg.norm(down, axis=1)
-    some = slope > 0.4
-    angle = np.abs((pieces.tangents()[::2] * down).sum(axis=1)[some] / slope[some])
+    steepness = np.linalg.norm(down, axis=1)
+    some = steepness > 0.4
+    angle = np.abs((pieces.tangents()[::2] * down).sum(axis=1)[some] / steepness[some])
     assert np.quantile(angle, 0.05) > 0.97
 
 
 def test_true_directions_are_the_mean_over_a_cube() -> None:
     # in one cube of 4 mm two strands 30° to either side of z, in the next one along y, then none
-    slope = np.tan(np.radians(30)) * 2e-3
+    steepness = np.tan(np.radians(30)) * 2e-3
     true = Strands.from_list(
         [
-            np.array([[0.001, 0.002 - slope, 0], [0.001, 0.002 + slope, 0.004]]),
-            np.array([[0.002, 0.002 + slope, 0], [0.002, 0.002 - slope, 0.004]]),
+            np.array([[0.001, 0.002 - steepness, 0], [0.001, 0.002 + steepness, 0.004]]),
+            np.array([[0.002, 0.002 + steepness, 0], [0.002, 0.002 - steepness, 0.004]]),
             np.array([[0.006, 0.0, 0.002], [0.006, 0.004, 0.002]]),
         ]
     )

@@ -71,7 +71,7 @@ def test_angles(angle: float, expected: tuple[int, int, int]) -> None:
     assert tuple(scores[n]["precision"] for n in NAMES) == expected
 
 
-def test_direction_of_travel_counts_only_where_it_is_asked_for(front: Camera) -> None:
+def test_direction_of_travel_counts_only_on_request(front: Camera) -> None:
     true = curtain()
     flipped = Strands.from_list([true[i][::-1] for i in range(len(true))])
     scores = compare_strands(flipped, true, visibility=Visibility([front], true))
@@ -250,10 +250,10 @@ def test_the_head_hides_and_the_image_ends(front: Camera) -> None:
     )
     behind = curtain(depth=5e-3)
     points = behind.resampled(1e-3).points
-    seen = Visibility([front], behind, plate)(points)
+    visible_points = Visibility([front], behind, plate)(points)
     below = points[:, 2] < -1.5e-3
-    assert not seen[below].any()
-    assert seen[points[:, 2] > 1.5e-3].all()
+    assert not visible_points[below].any()
+    assert visible_points[points[:, 2] > 1.5e-3].all()
     assert not Visibility([front], behind)(points + np.float32(0.2)).any()
 
 
@@ -269,9 +269,9 @@ def test_the_head_hides_where_the_true_strands_do_not_reach(front: Camera) -> No
     at = points * (1 / (1 + points[:, 1:2]))  # where rays from (0, -1, 0) to them meet the plate
     inside = (np.abs(at[:, [0, 2]]) < 0.059).all(axis=1)
     outside = (np.abs(at[:, [0, 2]]) > 0.061).any(axis=1)
-    seen = Visibility([front], short, plate)(points)
-    assert not seen[inside].any()
-    assert seen[outside].all()
+    visible_points = Visibility([front], short, plate)(points)
+    assert not visible_points[inside].any()
+    assert visible_points[outside].all()
     assert Visibility([front], short)(points).all()
 
 
@@ -311,7 +311,7 @@ print(f, seconds, most[1])
 
 
 @pytest.mark.parametrize("k1", [-0.25, 0.25])
-def test_what_a_lens_brings_into_the_picture_is_seen_and_hides(k1: float) -> None:
+def test_surfaces_inside_a_distorted_image_are_visible_and_occlude(k1: float) -> None:
     """A plane of short strands, some of it off the picture, and a second one behind it."""
     pinhole = Camera.look_at("lens", 200, 200, [0, -0.5, 0], [0, 0, 0], 60)
     lens = replace(pinhole, distortion=np.array([k1, 0.05 if k1 < 0 else 0.0]))

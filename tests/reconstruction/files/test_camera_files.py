@@ -120,7 +120,7 @@ def test_a_calib_file_gives_the_same_pixels_in_millimetres(tmp_path: Path) -> No
     assert_same_pixels([resized(c, 640, 480) for c in found], named)
 
 
-def test_cameras_that_metashape_has_not_aligned_are_told(tmp_path: Path) -> None:
+def test_cameras_not_aligned_by_metashape_give_a_warning(tmp_path: Path) -> None:
     path = tmp_path / "cameras.xml"
     writers.write_metashape(path, stage())
     file = read_cameras(path)
@@ -224,7 +224,7 @@ def test_pictures_say_how_large_they_are_where_the_file_does_not(suffix, tmp_pat
     assert_same_pixels(read_cameras(path).cameras, stage())
 
 
-def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
+def test_file_errors_name_the_problem(tmp_path: Path) -> None:
     folder = tmp_path / "sparse"
     writers.write_colmap_text(folder, stage())
     images, cameras = folder / "images.txt", folder / "cameras.txt"

@@ -71,7 +71,7 @@ def test_a_suffix_in_capitals_is_the_same_format(suffix: str, two: Strands, tmp_
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".hair"])
-def test_a_full_disk_is_told_of_the_file(suffix: str, two: Strands, tmp_path: Path) -> None:
+def test_a_full_disk_error_names_the_file(suffix: str, two: Strands, tmp_path: Path) -> None:
     path = tmp_path / f"hair{suffix}"
     (tmp_path / f".part-hair{suffix}").symlink_to("/dev/full")
     with pytest.raises(OSError, match=rf"No space left on device: '{path}'"):
@@ -79,7 +79,7 @@ def test_a_full_disk_is_told_of_the_file(suffix: str, two: Strands, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_alembic_asks_for_room_before_it_begins(
+def test_alembic_checks_free_space_before_writing(
     two: Strands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its library ends the process where the disk is full. 5 points are 80 bytes."""

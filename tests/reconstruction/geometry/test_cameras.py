@@ -86,7 +86,7 @@ def test_look_straight_up_or_down(eye: list[float], target: list[float]) -> None
     np.testing.assert_allclose(camera.project(target)[0], [31.5, 31.5])
 
 
-def test_what_is_behind_is_told_by_its_depth() -> None:
+def test_points_behind_the_camera_have_negative_depth() -> None:
     camera = Camera.look_at("c", 64, 64, [0, -1, 0], [0, 0, 0], 40)
     pixels, depth = camera.project([[0, -2, 0], [0.1, -1, 0]])
     assert depth[0] == pytest.approx(-1)

@@ -50,8 +50,8 @@ def in_world(cameras: list[Camera], turn: np.ndarray, unit: float) -> list[Camer
 
 
 def check(cameras: list[Camera], **options) -> list[str]:
-    asked = PlacementOptions(**options)
-    return check_cameras(placed(cameras, asked, "opencv"), asked, "opencv")
+    requested = PlacementOptions(**options)
+    return check_cameras(placed(cameras, requested, "opencv"), requested, "opencv")
 
 
 def test_a_good_stage_passes_and_says_how_large_it_is() -> None:

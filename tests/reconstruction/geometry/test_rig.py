@@ -69,7 +69,7 @@ def test_look_at_field_of_view_is_between_the_outer_pixel_edges():
     assert np.degrees(np.arccos(left @ right)) == pytest.approx(25.0)
 
 
-def test_roll_turns_the_camera_clockwise_seen_from_behind():
+def test_roll_turns_the_camera_clockwise_as_viewed_from_behind():
     # The camera turns clockwise, so the world turns counter-clockwise in its image: up goes left.
     above, _ = camera(roll_deg=90.0).project([0, 0.1, 0.05])
     assert above[0] < 79.5

@@ -109,7 +109,7 @@ def test_preconditioner_is_symmetric() -> None:
     assert float((u * M(u)).sum()) > 0
 
 
-def test_solver_that_cannot_get_there_says_so() -> None:
+def test_solver_without_convergence_raises_an_error() -> None:
     A, b = random_problem()
     with pytest.raises(RuntimeError, match="after 2 iterations"):
         conjugate_gradients(A, b, np.zeros(b.shape), 1e-9, limit=2)

@@ -27,8 +27,8 @@ def test_hair_that_hangs_far_below_the_head_is_in_the_envelope() -> None:
     masks = {}
     for camera in cameras:
         mask = np.zeros((camera.height, camera.width), bool)
-        seen, column, row, _ = camera.pixels_of(hair)
-        mask[row[seen], column[seen]] = True
+        visible, column, row, _ = camera.pixels_of(hair)
+        mask[row[visible], column[visible]] = True
         masks[camera.name] = HairMask(mask, mask, mask & False, "user", 1.0)
     capture = Capture.__new__(Capture)
     capture.path, capture.rig = Path("long"), Rig("long", tuple(cameras), (), ())

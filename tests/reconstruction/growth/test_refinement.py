@@ -88,9 +88,9 @@ def test_strands_come_nearer_to_the_waves_that_lines_were_measured_on(
 
 
 def test_better_lines_give_better_strands() -> None:
-    start, asked = strands(1, 5e-4), RefineOptions(steps=4, marginal_coverage=0)
+    start, requested = strands(1, 5e-4), RefineOptions(steps=4, marginal_coverage=0)
     exact, fair, bad = (
-        errors(refine(start, lines(noise, angle), asked)[0])
+        errors(refine(start, lines(noise, angle), requested)[0])
         for noise, angle in ((0.0, 0.0), (3e-4, 8.0), (8e-4, 20.0))
     )
     assert exact[0] < fair[0] < bad[0]
@@ -161,24 +161,24 @@ def test_what_is_guessed_is_not_where_cameras_would_see_it(before: float, expect
         height=100,
     )
     z = np.arange(-0.03, 0.03, 1e-3)
-    seen = np.stack([np.full_like(z, -0.02), np.zeros_like(z), z], axis=1)
+    observed = np.stack([np.full_like(z, -0.02), np.zeros_like(z), z], axis=1)
     up = np.tile([0.0, 0.0, 1.0], (len(z), 1))
-    given = Strands.from_list([seen, seen + np.array([0.04, -before, 0])])
+    given = Strands.from_list([observed, observed + np.array([0.04, -before, 0])])
     surface = np.full((100, 100), 0.5)
     made, figures = refine(
         given,
-        Measured(seen, up, np.ones(len(z))),
+        Measured(observed, up, np.ones(len(z))),
         RefineOptions(marginal_coverage=0),
         [(camera, surface)],
     )
     middle = slice(len(z) + 20, len(z) + 50)  # the root stands
-    np.testing.assert_allclose(made.points[: len(z)], seen, atol=1e-6)  # what is measured stays
+    np.testing.assert_allclose(made.points[: len(z)], observed, atol=1e-6)  # what is measured stays
     np.testing.assert_allclose(made.points[middle, 1], expected, atol=0.1e-3)
     np.testing.assert_allclose(made.points[len(z)], given.points[len(z)], atol=1e-6)
     surface[:] = 0  # a camera that sees no hair there says nothing
     still, _ = refine(
         given,
-        Measured(seen, up, np.ones(len(z))),
+        Measured(observed, up, np.ones(len(z))),
         RefineOptions(marginal_coverage=0),
         [(camera, surface)],
     )

@@ -76,13 +76,13 @@ def cloud_of(capture: Capture, turn_deg: float = 0.0) -> tuple[PointCloud, dict[
         view = camera.center - p
         view /= np.linalg.norm(view, axis=1, keepdims=True)
         inside = camera.inside(camera.project(p)[0])
-        seen = inside & ((view * n).sum(axis=1) > 0.3)
+        visible = inside & ((view * n).sum(axis=1) > 0.3)
         pixels = np.rint(camera.project(p)[0]).astype(int)
         hair, skin = np.zeros((2, camera.height, camera.width), bool)
-        hair[tuple(pixels[seen & scalp].T[::-1])] = True
-        skin[tuple(pixels[seen & ~scalp].T[::-1])] = True
+        hair[tuple(pixels[visible & scalp].T[::-1])] = True
+        skin[tuple(pixels[visible & ~scalp].T[::-1])] = True
         masks[camera.name] = HairMask(hair | skin, hair, skin & ~hair, "reflectance", 1.0)
-        columns.append((p[seen], view[seen], pixels[seen], np.full(seen.sum(), k)))
+        columns.append((p[visible], view[visible], pixels[visible], np.full(visible.sum(), k)))
     points, view, pixel, camera_of = (np.concatenate(c) for c in zip(*columns, strict=True))
     count, zero = len(points), np.zeros(len(points))
     cloud = PointCloud(
@@ -102,7 +102,7 @@ def cloud_of(capture: Capture, turn_deg: float = 0.0) -> tuple[PointCloud, dict[
     return cloud, masks
 
 
-def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
+def test_a_head_is_fitted_to_digitised_scalp_points(capture: Capture) -> None:
     truth = the_head()
     points, _, face = surface_samples(truth, 8e-3)
     on = truth.scalp[face]
@@ -119,7 +119,7 @@ def test_a_head_is_laid_under_digitised_scalp_points(capture: Capture) -> None:
 
 
 @pytest.mark.parametrize("turn_deg", [pytest.param(0.0, marks=pytest.mark.slow), 35.0])
-def test_a_head_is_laid_under_the_skin_that_was_seen(capture: Capture, turn_deg: float) -> None:
+def test_a_head_is_fitted_to_observed_skin(capture: Capture, turn_deg: float) -> None:
     cloud, masks = cloud_of(capture, turn_deg)
     skin = skin_points(MaskedCapture(capture, masks), cloud)
     assert skin.hints.turn == pytest.approx(np.radians(turn_deg), abs=np.radians(30))

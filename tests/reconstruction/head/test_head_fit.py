@@ -42,7 +42,7 @@ def another_head() -> Mesh:
     return mesh.transformed(TURN, SHIFT)
 
 
-def seen(
+def observed(
     where: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, outliers: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points with 1 mm of noise and normals where `where(points, on_scalp)`, in the head's frame.
@@ -95,7 +95,7 @@ def posed(fit: HeadFit) -> Mesh:
     ids=["all", "30 % outliers, no normals", "scalp, 30 % outliers", "one side", "bare skin"],
 )
 def test_the_scalp_is_found_from(where, part, outliers, normals, median) -> None:  # type: ignore[no-untyped-def]
-    points, facing = seen(where, 2000, outliers)
+    points, facing = observed(where, 2000, outliers)
     fit = fit_head(points, facing if normals else None, hints=HeadHints(part=part))
     assert fit.pose.scale == pytest.approx(1.06, abs=0.05)
     off = off_the_true_scalp(fit.mesh)
@@ -109,14 +109,14 @@ def test_the_scalp_is_found_from(where, part, outliers, normals, median) -> None
 
 
 def test_few_points_give_a_pose() -> None:
-    points, normals = seen(everywhere, 30)
+    points, normals = observed(everywhere, 30)
     fit = fit_head(points, normals)
     assert np.percentile(off_the_true_scalp(fit.mesh), 95) < 12
     assert fit.deformed.to_points_median > 0.02  # and it shows that most of the head was not seen
 
 
 @pytest.mark.parametrize("part", ["head", "scalp"])
-def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: Part) -> None:
+def test_inward_normals_raise_an_error(part: Part) -> None:
     """As of scanners and meshes that are inside out; the head came out centimetres off."""
     head = generic_head()
     places, normals, face = surface_samples(head, 6e-3)
@@ -128,14 +128,14 @@ def test_normals_that_point_into_the_head_are_an_error_that_says_so(part: Part) 
         fit_head(points, -outward, hints=hints)
 
 
-def test_a_mesh_that_is_inside_out_is_an_error_that_says_so() -> None:
+def test_an_inverted_mesh_raises_an_error() -> None:
     head = generic_head()
     with pytest.raises(HeadFitError, match=r"reverse them \(for a mesh, its faces\)"):
         mark_scalp(Mesh(100 * head.vertices, head.faces[:, ::-1]))
 
 
-def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> None:
-    points, normals = seen(crown, 500)
+def test_a_crown_without_landmarks_is_reported_as_ambiguous() -> None:
+    points, normals = observed(crown, 500)
     fit = fit_head(points, normals, hints=HeadHints(part="scalp"))
     assert any("hardly determine" in w for w in fit.warnings)
     assert any("provide landmarks" in w for w in fit.warnings)
@@ -156,8 +156,8 @@ def test_a_crown_alone_is_ambiguous_and_says_so_until_landmarks_are_given() -> N
         (0.6, "times the template's size"),
     ],
 )
-def test_another_unit_is_an_error_that_says_so(factor: float, words: str) -> None:
-    points, normals = seen(everywhere, 300)
+def test_wrong_unit_raises_an_error(factor: float, words: str) -> None:
+    points, normals = observed(everywhere, 300)
     with pytest.raises(HeadFitError, match=words):
         fit_head(factor * points, normals)
 
@@ -177,8 +177,8 @@ def test_points_that_are_no_head_are_errors(points: np.ndarray, words: str) -> N
         fit_head(points)
 
 
-def test_what_else_is_asked_wrongly() -> None:
-    points, normals = seen(everywhere, 50)
+def test_invalid_arguments_raise_errors() -> None:
+    points, normals = observed(everywhere, 50)
     bare = Mesh(generic_head().vertices, generic_head().faces)
     with pytest.raises(HeadFitError, match="marks no scalp"):
         fit_head(points, template=bare, hints=HeadHints(part="scalp"))

@@ -100,7 +100,7 @@ class Shaded(Capture):
     def __init__(self, head: Mesh, cameras: list[Camera], lights: tuple[Light, ...]) -> None:
         self.path, self.rig = Path("shaded"), Rig("shaded", tuple(cameras), lights)
         points, normals, face = surface_samples(head, 2e-3)
-        tree, self.masks, self._seen = cKDTree(points), {}, {}
+        tree, self.masks, self._views = cKDTree(points), {}, {}
         thick = points[head.scalp[face]]
         thick = np.concatenate([thick + h * normals[head.scalp[face]] for h in (0.5 * HAIR, HAIR)])
         for camera in cameras:
@@ -110,13 +110,13 @@ class Shaded(Capture):
             at = camera.center + rays * (depth[y, x] / (rays @ camera.R[2]))[:, None]
             near = tree.query(at)[1]
             hair, skin = np.zeros((2, camera.height, camera.width), bool)
-            seen, column, row, far = camera.pixels_of(thick)
+            visible, column, row, far = camera.pixels_of(thick)
             before = far <= depth[row, column]
-            hair[row[seen & before], column[seen & before]] = True
+            hair[row[visible & before], column[visible & before]] = True
             hair = ndimage.binary_closing(hair, iterations=2)
             skin[y, x] = ~head.scalp[face[near]]
             self.masks[camera.name] = HairMask(hair | skin, hair, skin & ~hair, "user", 1.0)
-            self._seen[camera.name] = y, x, at, normals[near]
+            self._views[camera.name] = y, x, at, normals[near]
 
     def olat_lights(self) -> list[str]:
         return [light.name for light in self.rig.lights]
@@ -125,7 +125,7 @@ class Shaded(Capture):
         return True
 
     def light(self, light: str, camera: str) -> Any:
-        y, x, at, normals = self._seen[camera]
+        y, x, at, normals = self._views[camera]
         device, lamp = self.rig.camera(camera), self.rig.light(light)
         away = lamp.position - at
         square = (away**2).sum(axis=1)
@@ -141,7 +141,7 @@ def around(size: int) -> list[Camera]:
 
 
 @pytest.mark.parametrize("size", [160, pytest.param(400, marks=pytest.mark.slow)])
-def test_a_head_is_laid_under_the_face_that_lights_show(head: Mesh, size: int) -> None:
+def test_a_head_is_fitted_to_the_lit_face(head: Mesh, size: int) -> None:
     """Finer pixels than the hull's voxels are averaged, and find the same."""
     capture = Shaded(head, around(size), LIGHTS)
     masked = MaskedCapture(capture, capture.masks)
@@ -193,7 +193,7 @@ def test_a_hull_takes_the_head_and_none_from_a_face_unlike_the_template(
 
 
 @pytest.mark.slow
-def test_few_lights_or_little_skin_tell_nothing(head: Mesh) -> None:
+def test_few_lights_or_little_skin_give_no_points(head: Mesh) -> None:
     few = Shaded(head, around(120), LIGHTS[:20])
     masked = MaskedCapture(few, few.masks)
     with pytest.raises(CaptureError, match="24 single lights"):

@@ -91,7 +91,7 @@ def test_one_light_that_stands_elsewhere_is_found(lit) -> None:
         ((2, 0, 1), (1, 1, 1), "y z x"),
     ],
 )
-def test_lights_in_another_world_than_the_cameras_are_told(lit, axes, signs, named) -> None:
+def test_lights_in_another_frame_than_the_cameras_give_a_warning(lit, axes, signs, named) -> None:
     pictures, places, eyes = lit
     assert check_light_axes(pictures, places, eyes) == []
     (said,) = check_light_axes(pictures, places[:, axes] * signs, eyes)

@@ -122,13 +122,13 @@ class FibreStage:
     def views(self) -> list[View]:
         """Exact views: true lines, true shadows."""
         out = []
-        for camera, seen in zip(self.cameras, self.drawn, strict=True):
-            shine = np.moveaxis(lit(seen.point, self.lights), -1, 0).astype(float)
-            dark = np.zeros((1, *seen.mask.shape))  # gives the threshold: nothing is lit by it
-            codes = code_map(np.concatenate([shine, dark]), seen.mask, len(self.lights))
-            lines = line_vectors(seen.angle, seen.mask * 1.0)
+        for camera, observed in zip(self.cameras, self.drawn, strict=True):
+            shine = np.moveaxis(lit(observed.point, self.lights), -1, 0).astype(float)
+            dark = np.zeros((1, *observed.mask.shape))  # gives the threshold: nothing is lit by it
+            codes = code_map(np.concatenate([shine, dark]), observed.mask, len(self.lights))
+            lines = line_vectors(observed.angle, observed.mask * 1.0)
             beside = light_beside(camera, self.lights)
-            out.append(View(camera, seen.mask, lines, codes, beside))
+            out.append(View(camera, observed.mask, lines, codes, beside))
         return out
 
     def depth(self, view: int) -> Array:
@@ -157,12 +157,12 @@ class FibreStage:
         (path / "plan.json").write_text(json.dumps({"steps": steps}))
         lines = []
         rng = np.random.default_rng(4)
-        for camera, seen in zip(self.cameras, self.drawn, strict=True):
-            tint = 0.6 + 0.4 * np.sin(seen.point @ rng.normal(size=3) * 900)
-            shine = np.where(lit(seen.point, self.lights), 1.0, 0.05) * tint[..., None]
-            shine = np.where(seen.mask[..., None], brightness * shine, 0)
+        for camera, observed in zip(self.cameras, self.drawn, strict=True):
+            tint = 0.6 + 0.4 * np.sin(observed.point @ rng.normal(size=3) * 900)
+            shine = np.where(lit(observed.point, self.lights), 1.0, 0.05) * tint[..., None]
+            shine = np.where(observed.mask[..., None], brightness * shine, 0)
             for i in range(len(steps)):
-                image = np.zeros(seen.mask.shape) if i == 0 else shine[..., i - 1]
+                image = np.zeros(observed.mask.shape) if i == 0 else shine[..., i - 1]
                 image = image + 1e-4 * rng.standard_normal(image.shape)
                 file = f"frames/{i:05d}/{camera.name}.exr"
                 (path / file).parent.mkdir(parents=True, exist_ok=True)
@@ -171,7 +171,7 @@ class FibreStage:
                 write_exr(path / file, rgb, attributes, compress=False)
                 lines.append(json.dumps({"step": i, "camera": camera.name, "file": file}))
             if masks:
-                wider = cv2.dilate(seen.mask.astype(np.uint8) * 255, np.ones((3, 3)))
+                wider = cv2.dilate(observed.mask.astype(np.uint8) * 255, np.ones((3, 3)))
                 cv2.imwrite(str(path / "masks" / f"{camera.name}.png"), wider)
         (path / "journal.jsonl").write_text("\n".join(lines) + "\n")
         return Capture(path)

@@ -48,8 +48,8 @@ def test_photometric_finds_the_fibres_and_reports_what_it_saw(
     shot: Capture, fibres: Any, tmp_path: Path
 ) -> None:
     report = run(shot, tmp_path)
-    told = [s.name for s in estimate(shot, method="photometric", options=QUICK).stages]
-    assert told == [s.name for s in report.stages]
+    reported = [s.name for s in estimate(shot, method="photometric", options=QUICK).stages]
+    assert reported == [s.name for s in report.stages]
     strands = read_strands(tmp_path / "strands.npz")
     figures = compare_strands(strands, fibres.strands, samples=None)["all"]
     assert figures["2mm_20deg"]["f"] > 0.6
@@ -70,7 +70,7 @@ def test_the_baseline_runs_on_the_same_capture(shot: Capture, fibres: Any, tmp_p
 
 
 @pytest.mark.slow
-def test_no_light_beside_a_camera_is_said(
+def test_no_light_beside_a_camera_gives_a_warning(
     make_fibres: Any, fibre_lamps: Any, fibre_cameras: Any, tmp_path: Path
 ) -> None:
     lights = [replace(x, position=x.position * [1, 1, -1]) for x in fibre_lamps(36)]

@@ -25,10 +25,10 @@ def test_depths_are_true_below_a_pixel(fibres: Any, method: type[DepthSearch]) -
     assert len(found.x) > 0.85 * fibres.views[1].mask.sum()
     pixel = 1e3 * fibres.depth(1).max() / fibres.cameras[1].K[0, 0]
     assert np.median(error(fibres, 1, found)) < pixel
-    seen = fibres.drawn[1]
-    ahead = fibres.cameras[1].project(seen.point[found.y, found.x] + 1e-5 * found.direction)[0]
-    flow = ahead - fibres.cameras[1].project(seen.point[found.y, found.x])[0]
-    angle = np.arctan2(flow[:, 1], flow[:, 0]) - seen.angle[found.y, found.x]
+    observed = fibres.drawn[1]
+    ahead = fibres.cameras[1].project(observed.point[found.y, found.x] + 1e-5 * found.direction)[0]
+    flow = ahead - fibres.cameras[1].project(observed.point[found.y, found.x])[0]
+    angle = np.arctan2(flow[:, 1], flow[:, 0]) - observed.angle[found.y, found.x]
     off = np.degrees(np.abs((angle + np.pi / 2) % np.pi - np.pi / 2))
     assert np.median(off) < 8
 
@@ -76,7 +76,7 @@ def test_pixels_between_those_of_a_lattice_are_searched_where_these_found_hair()
     np.testing.assert_array_equal(further[:8, :8], far[:8, :8])
 
 
-def test_lights_beside_cameras_tell_who_sees_a_pixel(fibres: Any) -> None:
+def test_lights_beside_cameras_determine_visibility_of_a_pixel(fibres: Any) -> None:
     search = DepthSearch(fibres.views, (0, 0, 0))
     y, x = np.nonzero(fibres.views[0].mask)
     sees = search.visible(0, y, x)

@@ -54,7 +54,7 @@ def test_what_is_far_shorter_than_the_gaussian_becomes_its_chord(length: float) 
     )
 
 
-def test_lines_that_are_smoothed_together_know_nothing_of_one_another() -> None:
+def test_jointly_smoothed_lines_are_independent() -> None:
     """Straight ones stay as they are, however short; a wave loses what a Gaussian takes of it."""
     rng = np.random.default_rng(5)
     straight = [

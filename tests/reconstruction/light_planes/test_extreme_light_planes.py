@@ -267,7 +267,7 @@ def leaps(
     )
 
 
-def test_motion_beyond_the_search_window_is_told_and_its_stripes_are_left_out(
+def test_motion_beyond_the_search_window_is_reported_and_its_stripes_are_skipped(
     leaps: Capture,
 ) -> None:
     said = Stage("motion")
@@ -288,7 +288,7 @@ def test_motion_beyond_the_search_window_is_told_and_its_stripes_are_left_out(
     assert (motion.known(after.step)).all()
 
 
-def test_a_subject_that_left_for_good_leaves_what_was_seen_before(shoot: Shoot) -> None:
+def test_a_subject_that_left_gives_a_warning_and_no_points(shoot: Shoot) -> None:
     gone = (np.eye(3), np.array([3.0, 0.0, 0.0]))
     capture = shoot(poses=[(np.eye(3), np.zeros(3)), gone], every=20)
     said = Stage("motion")

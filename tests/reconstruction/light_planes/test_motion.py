@@ -54,7 +54,7 @@ def test_registration_states_its_noise() -> None:
     assert 0.4 * stated < spread < 2.5 * stated
 
 
-def test_templates_without_mask_or_detail_say_so() -> None:
+def test_templates_without_mask_or_detail_raise_errors() -> None:
     with pytest.raises(ValueError, match="mask is empty"):
         Template(np.ones((8, 8)), np.zeros((8, 8), bool))
     with pytest.raises(ValueError, match="no detail"):
@@ -189,7 +189,7 @@ def test_a_capture_without_tracking_frames_is_still(shoot: Callable[..., Capture
     assert stage.left_out
 
 
-def test_one_camera_determines_a_part_and_says_so(
+def test_one_camera_determines_part_of_the_motion_and_reports_it(
     shoot: Callable[..., Capture], stage_camera: Callable[..., Camera]
 ) -> None:
     capture = shoot(cameras=[stage_camera("only", -40)], poses=drift(4))
@@ -217,10 +217,10 @@ def test_one_camera_determines_a_part_and_says_so(
     device = capture.rig.cameras[0]
     Q, s = drift(4)[-1]
     near = device.center * (0.1 / np.linalg.norm(device.center))
-    seen = device.project(Q @ near + s)[0]
+    observed = device.project(Q @ near + s)[0]
     found = device.project(motion.rotations[-1] @ near + motion.translations[-1])[0]
-    assert np.linalg.norm(seen - device.project(near)[0]) > 0.3
-    assert np.linalg.norm(found - seen) < 0.25
+    assert np.linalg.norm(observed - device.project(near)[0]) > 0.3
+    assert np.linalg.norm(found - observed) < 0.25
 
 
 def test_poses_between_tracking_frames() -> None:

@@ -94,7 +94,7 @@ def test_a_sweep_that_lights_nothing_gives_an_empty_cloud(shoot: Shoot) -> None:
     assert any("no stripe of" in w for w in stage.warnings)
 
 
-def test_a_capture_without_a_sweep_says_so(shoot: Shoot) -> None:
+def test_a_capture_without_a_sweep_raises_an_error(shoot: Shoot) -> None:
     with pytest.raises(CaptureError, match="no scanline frames"):
         triangulate(shoot(sweep=False))
 

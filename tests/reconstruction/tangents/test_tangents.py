@@ -116,7 +116,7 @@ def test_no_texture_gives_no_confidence() -> None:
     assert decide(np.zeros((3, 50), np.float32), candidates).confidence.max() == 0
 
 
-def test_points_behind_the_seen_surface_are_not_seen() -> None:
+def test_points_behind_the_visible_surface_are_hidden() -> None:
     c = camera((0.0, -1.0, 0.0))
     depth = np.full((64, 64), np.linalg.norm(c.center))
     depth[:, 48:] = 0  # nothing is known there
@@ -159,11 +159,11 @@ def turning_patch(full: float = np.inf, missing: int = 0):
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
         sines = np.einsum("pld,pd->pl", away / far, truth)
         s = sines + (to_camera * truth).sum(axis=1, keepdims=True)
-        answer = 0.15 + np.exp(-(s**2) / (2 * 0.3**2))
-        answer = answer * np.maximum((away / far)[..., 0], 0.02) / far[..., 0] ** 2
+        profile = 0.15 + np.exp(-(s**2) / (2 * 0.3**2))
+        profile = profile * np.maximum((away / far)[..., 0], 0.02) / far[..., 0] ** 2
         x_, y_ = np.rint(c.project(points)[0]).astype(int).T
         image = np.zeros((len(lights), 48, 48))
-        image[:, y_, x_] = answer.T
+        image[:, y_, x_] = profile.T
         clipped = image >= full * image.max()
         image = np.where(clipped, 0.3 * image.max(), image)  # as if there had never been more
         image[:missing] = 0
@@ -181,7 +181,7 @@ def test_reflection_finds_directions_that_texture_does_not_know(full, missing) -
 
     As well where highlights are cut off at half of their height, and where frames are missing.
     """
-    points, truth, seen_so = turning_patch(full, missing)
+    points, truth, observed_directions = turning_patch(full, missing)
     rng = np.random.default_rng(3)
     first = truth.copy()
     wrong = rng.random(len(points)) > 0.45
@@ -189,7 +189,7 @@ def test_reflection_finds_directions_that_texture_does_not_know(full, missing) -
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     candidates = half_sphere(800)
     known = Tangents(first, np.where(wrong, 0.1, 0.9))
-    scores, table = reflection_scores(seen_so, points, candidates, known)
+    scores, table = reflection_scores(observed_directions, points, candidates, known)
     assert table.contrast > 2
     error = degrees_between(decide(scores, candidates).directions, truth)
     assert np.median(error) < 4
@@ -199,13 +199,13 @@ def test_reflection_finds_directions_that_texture_does_not_know(full, missing) -
 
 def test_a_table_filled_anew_brings_directions_nearer() -> None:
     """Directions 18 degrees off blur the table; those that it tells fill it sharper."""
-    points, truth, seen_so = turning_patch()
+    points, truth, observed_directions = turning_patch()
     scatter = np.tan(np.radians(15)) * np.random.default_rng(3).normal(size=truth.shape)
     first = (truth + scatter) / np.linalg.norm(truth + scatter, axis=1, keepdims=True)
     candidates = half_sphere(800)
     known, errors = Tangents(first, np.ones(len(points))), []
     for _ in range(2):
-        scores, _ = reflection_scores(seen_so, points, candidates, known)
+        scores, _ = reflection_scores(observed_directions, points, candidates, known)
         known = decide(scores, candidates)
         errors.append(np.median(degrees_between(known.directions, truth)))
     assert errors[1] < 0.7 * errors[0]
@@ -231,13 +231,13 @@ def test_observations_undo_distance_and_intensity() -> None:
     cosines = np.array([1 / np.hypot(1, 0.2), 1 / np.hypot(1, 0.2)])
     far2 = np.array([1.04, 4.16])
     olat = (np.array([2.0, 5.0]) * cosines / far2)[:, None, None] * np.ones((2, 64, 64))
-    seen = np.array([True])
+    visible = np.array([True])
     o = observe(
         OlatStack(c, olat, np.ones(olat.shape, bool)),
         lights,
         np.zeros((1, 3)),
         np.array([[1.0, 0, 0]]),
-        seen,
+        visible,
     )
     np.testing.assert_allclose(o.response, 1, rtol=1e-5)
     np.testing.assert_allclose(o.facing[0], cosines, rtol=1e-6)

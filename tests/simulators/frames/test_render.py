@@ -71,7 +71,7 @@ def test_an_error_in_the_renderer_reaches_the_caller(responder):
         responder.lights("nobody")
 
 
-def test_a_subject_that_moves_is_seen_to_move(tiny_rig, subject):
+def test_a_moving_subject_moves_in_the_frames(tiny_rig, subject):
     """2 cm of drift, exaggerated to show at 16 pixels, against the shift that geometry predicts."""
     drift = Drift(3, 0.02, 1)
     still = MitsubaResponder(tiny_rig, subject, drift, QUALITY, 0)
@@ -90,7 +90,7 @@ def test_a_subject_that_moves_is_seen_to_move(tiny_rig, subject):
     assert middle(k) - middle(0) == pytest.approx(expected, abs=0.5)
 
 
-def test_how_a_renderer_ended_is_told():
+def test_the_exit_of_a_renderer_is_reported():
     process = RenderProcess(functools.partial(os._exit, 7))
     with pytest.raises(RenderError, match="exit code 7"):
         process.lights("cam_a")

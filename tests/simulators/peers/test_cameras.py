@@ -21,12 +21,12 @@ def expected(radiance):
 
 def armed(bench, name="cam_a"):
     camera = bench.camera(name)
-    assert camera.ask(op="arm", exposure=EXPOSURE) == {"ok": True}
+    assert camera.send(op="arm", exposure=EXPOSURE) == {"ok": True}
     return camera
 
 
 def pulse(bench):
-    assert bench.trigger.ask("PULSE 10000").startswith("OK ")
+    assert bench.trigger.send("PULSE 10000").startswith("OK ")
 
 
 def lit(image):
@@ -35,8 +35,8 @@ def lit(image):
 
 
 def test_hello_describes_the_camera(bench):
-    answer = bench.camera("cam_b").ask(op="hello", camera="cam_b")
-    assert answer == {
+    reply = bench.camera("cam_b").send(op="hello", camera="cam_b")
+    assert reply == {
         "ok": True,
         "width": 16,
         "height": 16,
@@ -87,7 +87,7 @@ def test_lamps_that_the_watchdog_put_off_make_dark_frames(bench):
 
 def test_saturation_and_exposure(bench):
     camera = bench.camera("cam_a")
-    camera.ask(op="arm", exposure=0.2)
+    camera.send(op="arm", exposure=0.2)
     bench.select(65535)
     pulse(bench)
     image = camera.frame().reshape(-1, 3)
@@ -105,8 +105,8 @@ def test_block_ids_and_queue_order(bench):
     assert first["exposure"] == EXPOSURE
     assert second["timestamp"] >= first["timestamp"]
     assert nothing == {"ok": True, "status": "empty"}
-    camera.ask(op="hello", camera="cam_a")
-    camera.ask(op="arm", exposure=EXPOSURE)
+    camera.send(op="hello", camera="cam_a")
+    camera.send(op="arm", exposure=EXPOSURE)
     pulse(bench)
     assert camera.read()["block_id"] == 1
 
@@ -114,10 +114,10 @@ def test_block_ids_and_queue_order(bench):
 def test_arming_empties_the_queue_and_disarming_stops_frames(bench):
     camera = armed(bench)
     pulse(bench)
-    camera.ask(op="arm", exposure=EXPOSURE)
+    camera.send(op="arm", exposure=EXPOSURE)
     assert camera.read()["status"] == "empty"
     pulse(bench)
-    camera.ask(op="disarm")
+    camera.send(op="disarm")
     pulse(bench)
     assert camera.read()["status"] == "frame"
     assert camera.read()["status"] == "empty"
@@ -130,7 +130,7 @@ def test_a_dropped_frame_is_missing_once_and_on_one_camera(start):
         pulse(bench)
     assert [a.read().get("block_id") for _ in range(3)] == [1, 2, None]
     assert [b.read().get("block_id") for _ in range(3)] == [1, 2, 3]
-    bench.trigger.ask("RESET")
+    bench.trigger.send("RESET")
     for _ in range(2):
         pulse(bench)
     assert [a.read()["block_id"] for _ in range(2)] == [3, 4]
@@ -142,7 +142,7 @@ def test_a_mute_camera_leaves_the_other_alone(start):
     pulse(bench)
     a.socket.settimeout(0.2)
     with pytest.raises(TimeoutError):
-        a.ask(op="read")
+        a.send(op="read")
     assert b.read()["status"] == "frame"
 
 
@@ -157,12 +157,12 @@ def test_a_mute_camera_leaves_the_other_alone(start):
         ([1, 2], "unknown op"),
     ],
 )
-def test_bad_requests_are_answered_with_what_is_wrong(bench, request_, said):
+def test_bad_requests_get_the_reason_as_reply(bench, request_, said):
     camera = bench.camera("cam_a")
-    answer = camera.raw(json.dumps(request_).encode())
-    assert answer["ok"] is False
-    assert said in answer["error"]
-    assert camera.ask(op="read") == {"ok": True, "status": "empty"}
+    reply = camera.raw(json.dumps(request_).encode())
+    assert reply["ok"] is False
+    assert said in reply["error"]
+    assert camera.send(op="read") == {"ok": True, "status": "empty"}
 
 
 def test_bytes_that_are_not_json_are_an_error(bench):
@@ -191,7 +191,7 @@ def test_busy_while_the_frame_is_rendered(start):
     camera = armed(bench)
     bench.select(1)
     pulse(bench)
-    assert camera.ask(op="read") == {"ok": True, "status": "busy"}
+    assert camera.send(op="read") == {"ok": True, "status": "busy"}
     begun = time.monotonic()
     assert bench.lights.read_input_registers(1).registers == [1]
     assert time.monotonic() - begun < 5  # of the 10 that the renderer waits
@@ -208,9 +208,9 @@ def test_a_renderer_that_fails_is_the_cameras_error(start):
     camera = armed(bench)
     bench.select(1)
     pulse(bench)
-    answer = camera.read()
-    assert answer["ok"] is False
-    assert "no libLLVM" in answer["error"]
+    reply = camera.read()
+    assert reply["ok"] is False
+    assert "no libLLVM" in reply["error"]
 
 
 def test_same_seed_same_bytes_and_another_seed_other_noise(start):

@@ -49,9 +49,9 @@ def test_level_zero_is_not_lit(bench):
 
 @pytest.mark.parametrize(("address", "value"), [(1002, 99), (1002, 60001), (1000, 6)])
 def test_values_out_of_range_are_refused(bench, address, value):
-    answer = bench.lights.write_register(address, value)
-    assert answer.isError()
-    assert answer.exception_code == ILLEGAL_VALUE
+    reply = bench.lights.write_register(address, value)
+    assert reply.isError()
+    assert reply.exception_code == ILLEGAL_VALUE
     assert bench.lights.read_holding_registers(1000, count=3).registers == [0, 0, 2000]
 
 
@@ -95,16 +95,16 @@ def test_time_in_the_dark_does_not_count(bench):
 def test_interlock_cuts_the_lamps(start):
     bench = start(Fault("trigger", "interlock", 1))
     bench.select(65535)
-    assert bench.trigger.ask("PULSE 1000") == "OK 1"
+    assert bench.trigger.send("PULSE 1000") == "OK 1"
     assert status(bench)[:2] == [0b0010, 0]
     bench.select(65535)
     assert status(bench)[1] == 0
 
 
-def test_hanging_bank_answers_nothing_but_its_watchdog_goes_on(start):
+def test_hanging_bank_sends_no_reply_but_its_watchdog_runs(start):
     bench = start(Fault("lights", "hang", 1))
     bench.select(65535)
-    bench.trigger.ask("PULSE 1000")
+    bench.trigger.send("PULSE 1000")
     wires = bench.wires["lights"]
     client = ModbusTcpClient(wires["host"], port=wires["port"], timeout=0.2, retries=0)
     assert client.connect()

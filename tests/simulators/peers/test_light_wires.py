@@ -35,7 +35,7 @@ def rtu(tmp_path):
     peer.stop()
 
 
-def test_an_answer_takes_the_time_of_the_line(rtu):
+def test_a_reply_takes_the_time_of_the_line(rtu):
     lamps, port = rtu
     began = time.monotonic()
     port.write(with_crc(SELECT_2))
@@ -56,7 +56,7 @@ def test_an_answer_takes_the_time_of_the_line(rtu):
     ],
     ids=["wrong CRC", "other unit", "cut short", "a byte too many", "one byte"],
 )
-def test_what_is_not_for_it_is_neither_answered_nor_carried_out(rtu, frame):
+def test_requests_to_another_unit_get_no_reply_and_no_effect(rtu, frame):
     lamps, port = rtu
     port.timeout = 0.05
     port.write(frame)
@@ -67,7 +67,7 @@ def test_what_is_not_for_it_is_neither_answered_nor_carried_out(rtu, frame):
     assert port.read(8) == with_crc(SELECT_2)
 
 
-def test_a_broadcast_is_carried_out_and_not_answered(rtu):
+def test_a_broadcast_takes_effect_without_a_reply(rtu):
     lamps, port = rtu
     port.write(with_crc(SELECT_2))
     port.read(8)
@@ -96,7 +96,7 @@ def widget(tmp_path):
     peer.stop()
 
 
-def test_the_widget_tells_its_parameters_user_data_and_serial_number(widget):
+def test_the_widget_reports_its_parameters_user_data_and_serial_number(widget):
     _, port = widget
     port.write(message(3, b"\0\0") + message(10) + message(3, b"\2\0"))
     expected = PARAMETERS + message(10, bytes.fromhex("78563412"))

@@ -125,7 +125,7 @@ def test_sintel_fits_the_demo_rig(shared_data):
     check_fits(subject, Rig.load(DEMO))
 
 
-def test_a_subject_elsewhere_is_an_error_that_says_so(tiny_rig, subjects):
+def test_a_subject_outside_the_rig_raises_an_error(tiny_rig, subjects):
     subject = subjects["wavy"]
     check_fits(subject, tiny_rig)
     moved = subject.strands.transformed(np.eye(3), [0, 0, 1.6])

@@ -10,14 +10,14 @@ from stage_service.acquisition.accounting import FrameAccount, PulseAccount
 from stage_service.devices.errors import IndexShift
 
 
-def account(last: int | None = None, unanswered: int = 0) -> FrameAccount:
+def account(last: int | None = None, without_frame: int = 0) -> FrameAccount:
     result = FrameAccount("cam_00", 65535)
-    result.last, result.unanswered = last, unanswered
+    result.last, result.without_frame = last, without_frame
     return result
 
 
 @pytest.mark.parametrize(
-    ("last", "unanswered", "block_id"),
+    ("last", "without_frame", "block_id"),
     [
         (None, 0, 1),
         (7, 0, 8),
@@ -28,14 +28,14 @@ def account(last: int | None = None, unanswered: int = 0) -> FrameAccount:
         (65534, 2, 2),
     ],
 )
-def test_block_ids_that_fit_the_pulses(last, unanswered, block_id):
-    one = account(last, unanswered)
+def test_block_ids_that_fit_the_pulses(last, without_frame, block_id):
+    one = account(last, without_frame)
     one.arrived(block_id)
-    assert (one.last, one.unanswered) == (block_id, 0)
+    assert (one.last, one.without_frame) == (block_id, 0)
 
 
 @pytest.mark.parametrize(
-    ("last", "unanswered", "block_id", "expected"),
+    ("last", "without_frame", "block_id", "expected"),
     [
         (None, 0, 2, "block id 1"),
         (7, 0, 7, "block id 8"),  # repeated
@@ -46,9 +46,9 @@ def test_block_ids_that_fit_the_pulses(last, unanswered, block_id):
         (65534, 0, 65536, "block id 65535"),
     ],
 )
-def test_block_ids_that_do_not_fit_are_named(last, unanswered, block_id, expected):
+def test_block_ids_that_do_not_fit_are_named(last, without_frame, block_id, expected):
     with pytest.raises(IndexShift) as error:
-        account(last, unanswered).arrived(block_id)
+        account(last, without_frame).arrived(block_id)
     assert error.value.expected == expected
     assert error.value.received == f"block id {block_id}"
 
@@ -56,7 +56,7 @@ def test_block_ids_that_do_not_fit_are_named(last, unanswered, block_id, expecte
 def test_a_late_frame_needs_an_unanswered_pulse():
     one = account(7, 2)
     one.late(8)
-    assert one.unanswered == 1
+    assert one.without_frame == 1
     one.arrived(10)
     with pytest.raises(IndexShift, match="no frame beside those of our pulses"):
         one.late(11)
@@ -98,7 +98,7 @@ def test_frames_are_placed_rightly_or_not_at_all(fates, last):
 def test_a_whole_run_is_placed_over_a_wrap():
     one = account(last=65530)
     assert one.place([65531 + i if i < 5 else i - 4 for i in range(8)], 8) == [*range(8)]
-    assert (one.last, one.unanswered) == (3, 0)
+    assert (one.last, one.without_frame) == (3, 0)
 
 
 def test_a_lost_frame_leaves_a_gap_that_shows_its_place():
@@ -118,7 +118,7 @@ def test_runs_with_repeated_surplus_or_foreign_frames_are_refused(ids):
 def test_a_run_without_any_frame_is_all_missing():
     one = account(last=4)
     assert one.place([], 3) == []
-    assert one.unanswered == 3
+    assert one.without_frame == 3
 
 
 @given(
@@ -126,7 +126,7 @@ def test_a_run_without_any_frame_is_all_missing():
     drift=st.floats(-1e-4, 1e-4),
     jitter=st.lists(st.floats(0, 0.05), min_size=6, max_size=6),
 )
-def test_time_stamps_tell_a_frame_of_an_earlier_pulse(offset, drift, jitter):
+def test_time_stamps_identify_a_frame_of_an_earlier_pulse(offset, drift, jitter):
     one = FrameAccount("cam_00", 65535)
     one.armed()
     now, stamps = 1000.0, []

@@ -53,8 +53,8 @@ def check_frames(path: Path, cameras: tuple[str, ...] = ("cam_a", "cam_b")) -> C
         level = expected(step, pose)
         for camera in cameras:
             if level is not None and capture.has(step, camera):
-                seen = capture.frame(step, camera).mean()
-                assert seen == pytest.approx(level, abs=0.045), (step, camera)
+                brightness = capture.frame(step, camera).mean()
+                assert brightness == pytest.approx(level, abs=0.045), (step, camera)
     return capture
 
 
@@ -203,8 +203,8 @@ def test_a_run_that_is_cut_short_keeps_no_frame_of_a_lamp_that_lagged_behind(
 
     world.lamps.gate = lossy
     assert run.run() == "failed"
-    told = "estop" if end == "estop" else "counting the steps of a hardware-stepped run"
-    assert told in str(run.error)
+    cause = "estop" if end == "estop" else "counting the steps of a hardware-stepped run"
+    assert cause in str(run.error)
     assert is_dark(world)
     assert not [r for r in check_frames(tmp_path / "c").records.values() if r.file]
 

@@ -20,14 +20,14 @@ class Watch:
 
 
 def test_time_left_is_that_of_the_steps_that_were_measured():
-    clock, told = Watch(), list[Progress]()
-    run = RunProgress(STEPS, {"a": 0, "b": 0}, told.append, clock)
+    clock, reported = Watch(), list[Progress]()
+    run = RunProgress(STEPS, {"a": 0, "b": 0}, reported.append, clock)
     for step in STEPS[:10]:
         run.begin(step)
         clock.now += 60.0 if step.index == 0 else 2.0  # the first waits for a camera to warm up
-        run.answered()
-        assert (told[-1].here, told[-1].frames["a"]) == (1, step.index)
-        run.answered()
+        run.responded()
+        assert (reported[-1].here, reported[-1].frames["a"]) == (1, step.index)
+        run.responded()
         run.arrived("a")
         run.arrived("b")
         run.done(step)
@@ -45,25 +45,25 @@ def test_time_left_is_that_of_the_steps_that_were_measured():
     assert (now.step, now.kind, now.row, now.frames) == (13, "scanline", 12, {"a": 10, "b": 10})
     assert now.here == 0
     assert now.seconds_left == 17 * 0.5
-    assert len(told) >= 13
+    assert len(reported) >= 13
 
 
-def test_what_came_too_soon_to_be_told_is_told_once_while_the_run_waits():
-    clock, told = Watch(), list[Progress]()
-    run = RunProgress(STEPS, dict.fromkeys("abcd", 0), told.append, clock)
+def test_progress_within_the_interval_is_reported_once_while_the_run_waits():
+    clock, reported = Watch(), list[Progress]()
+    run = RunProgress(STEPS, dict.fromkeys("abcd", 0), reported.append, clock)
     run.begin(STEPS[0])
     for _ in range(3):
-        run.answered()
-    assert [now.here for now in told] == [0]
+        run.responded()
+    assert [now.here for now in reported] == [0]
     for _ in range(9):
         clock.now += 1.0
         run.waiting()
-    assert [now.here for now in told] == [0, 3]
+    assert [now.here for now in reported] == [0, 3]
 
 
 def test_a_run_of_the_box_is_as_far_as_its_slowest_camera():
-    clock, told = Watch(), list[Progress]()
-    run = RunProgress(STEPS, {"a": 3, "b": 3}, told.append, clock)
+    clock, reported = Watch(), list[Progress]()
+    run = RunProgress(STEPS, {"a": 3, "b": 3}, reported.append, clock)
     run.begin_run(STEPS[:10])
     clock.now += 30.0
     for _ in range(5):

@@ -84,7 +84,7 @@ def test_a_fault_of_one_driver_does_not_keep_the_projectors_lit():
     assert result.blocks
 
 
-def test_dark_by_a_contradicted_read_back_is_said_to_be_that():
+def test_dark_by_a_contradicted_read_back_is_reported_as_such():
     result = blackout(stage(Contradicted(), Beams()))
     assert result.state == "dark"
     assert "earlier lights reported lamps as off that were commanded on" in result.detail

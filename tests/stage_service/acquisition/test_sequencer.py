@@ -162,8 +162,8 @@ def test_an_emergency_stop_in_mid_exposure_is_named(rig_file, world, tmp_path):
 
     run.devices.trigger.pulse = stopped  # type: ignore[method-assign]
     assert run.run() == "failed"
-    told = "received 0 lit, the emergency stop is pressed. Clear the cause at the stage."
-    assert told in str(run.error)
+    message = "received 0 lit, the emergency stop is pressed. Clear the cause at the stage."
+    assert message in str(run.error)
     assert "watchdog" not in str(run.error).partition("; blackout")[0]
 
 
@@ -179,10 +179,10 @@ def test_a_lamp_that_stays_lit_is_named(rig_file, world, tmp_path):
     run.devices.trigger.pulse = stick  # type: ignore[method-assign]
     assert run.run() == "failed"
     (lamp,) = world.lit
-    told = f"expected 0 lamps lit, received 1 lit (light_{lamp:03d} was lit last)"
-    assert told in str(run.error)
+    message = f"expected 0 lamps lit, received 1 lit (light_{lamp:03d} was lit last)"
+    assert message in str(run.error)
     assert run.blackout is not None
-    assert told in run.blackout.detail
+    assert message in run.blackout.detail
 
 
 def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, tmp_path):
@@ -216,43 +216,43 @@ def test_lamps_that_stay_lit_are_unknown_and_unsafe(rig_file, world, tmp_path):
     assert "unknown, unsafe" in str(run.error)
 
 
-def test_pause_is_dark_and_resume_goes_on(rig_file, world, tmp_path):
-    seen: list[tuple[bool, int]] = []
+def test_pause_is_dark_and_resume_continues(rig_file, world, tmp_path):
+    observed: list[tuple[bool, int]] = []
     run = sequencer(rig_file, tmp_path / "c")
 
     def notify(kind: str, data: dict[str, Any]) -> None:
         if kind == "capture.step" and data["steps_done"] == 4:
             run.pause()
         if kind == "capture.state" and data["state"] == "paused":
-            seen.append((is_dark(world), world.pulses))
+            observed.append((is_dark(world), world.pulses))
             run.resume()
 
     run._notify = notify
     assert run.run() == "completed"
-    assert seen == [(True, 4)]
+    assert observed == [(True, 4)]
 
 
-def test_while_paused_a_bank_that_dies_is_told_and_one_that_is_mended_goes_on(
+def test_while_paused_a_dead_bank_is_reported_and_a_repaired_one_continues(
     rig_file, world, tmp_path
 ):
-    told: list[str | None] = []
+    reported: list[str | None] = []
     run = sequencer(rig_file, tmp_path / "c")
 
     def notify(kind: str, data: dict[str, Any]) -> None:
         if kind == "capture.step" and data["steps_done"] == 4:
             run.pause()
         if kind == "capture.state" and data["state"] == "paused":
-            told.append(data["error"])
-            world.deaf_lights = len(told) == 1
-            if len(told) == 3:
+            reported.append(data["error"])
+            world.deaf_lights = len(reported) == 1
+            if len(reported) == 3:
                 run.resume()
 
     run._notify = notify
     assert run.run() == "completed"
-    assert [text is not None for text in told] == [False, True, False]
-    assert told[1] is not None
-    assert told[1].startswith("light bank")
-    assert "lamps off. Remove the cause first: until then resuming fails the capture" in told[1]
+    assert [text is not None for text in reported] == [False, True, False]
+    assert reported[1] is not None
+    assert reported[1].startswith("light bank")
+    assert "lamps off. Remove the cause first: until then resuming fails the capture" in reported[1]
     assert run.error is None
     assert verify(tmp_path / "c") == []
 

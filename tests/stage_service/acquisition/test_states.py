@@ -19,11 +19,11 @@ from stage_service.acquisition.states import (
 def test_every_state_is_in_the_table_and_leads_to_done():
     assert set(TRANSITIONS) == set(get_args(State))
     for state in TRANSITIONS:
-        seen, new = set(), {state}
+        observed, new = set(), {state}
         while new:
-            seen |= new
-            new = {after for s in new for after in TRANSITIONS[s].values()} - seen
-        assert "done" in seen
+            observed |= new
+            new = {after for s in new for after in TRANSITIONS[s].values()} - observed
+        assert "done" in observed
     assert set(OUTCOMES.values()) < set(get_args(Outcome))
 
 
@@ -42,7 +42,7 @@ def test_whatever_is_not_in_the_table_is_refused_and_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("done", "told"),
+    ("done", "allowed"),
     [
         (("start",), "running; possible now: abort, pause"),
         (("start", "pause"), "pausing; possible now: abort, resume"),
@@ -52,13 +52,13 @@ def test_whatever_is_not_in_the_table_is_refused_and_changes_nothing():
         (("start", "complete", "finish"), "done (completed); possible now: nothing"),
     ],
 )
-def test_a_refusal_names_what_a_person_can_ask_for(done, told):
+def test_a_refusal_names_the_allowed_actions(done, allowed):
     machine = Machine()
     for action in done:
         machine.do(action)
     with pytest.raises(WrongState) as refused:
         machine.do("start")
-    assert str(refused.value) == f"cannot start a capture that is {told}"
+    assert str(refused.value) == f"cannot start a capture that is {allowed}"
 
 
 @pytest.mark.parametrize("end", [("abort", "stop"), ("fail",)])

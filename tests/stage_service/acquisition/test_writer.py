@@ -79,11 +79,11 @@ def test_a_slow_disk_makes_put_wait_instead_of_dropping(folder, monkeypatch):
 def test_a_frame_alone_is_journalled_without_waiting_for_more(folder, monkeypatch):
     committed, commit = threading.Event(), folder.commit
 
-    def tell(records: Any) -> None:
+    def record(records: Any) -> None:
         commit(records)
         committed.set()
 
-    monkeypatch.setattr(folder, "commit", tell)
+    monkeypatch.setattr(folder, "commit", record)
     writer = FrameWriter(folder, 32)
     writer.put(shot(STEPS[0]))
     assert committed.wait(10)
@@ -125,7 +125,7 @@ def test_many_frames_share_their_flushes(folder, monkeypatch):
     folder.close()
 
 
-def test_put_goes_on_raising_after_an_error(folder, monkeypatch):
+def test_put_keeps_raising_after_an_error(folder, monkeypatch):
     def full(*_args: Any, **_more: Any) -> Any:
         raise OSError(28, "No space left on device")
 

@@ -140,9 +140,11 @@ def test_a_capture_its_frames_and_its_job(http, server, head):
     cancelled = http.delete(f"/jobs/{job['id']}").json()
     assert (cancelled["state"], cancelled["outcome"]) == ("done", "cancelled")
 
-    asked = http.post("/jobs", json={"capture": done["id"], "pipeline": {"name": "reconstruct"}})
-    assert asked.status_code == 202
-    assert http.get(asked.headers["location"]).json()["capture"] == done["path"]
+    submitted = http.post(
+        "/jobs", json={"capture": done["id"], "pipeline": {"name": "reconstruct"}}
+    )
+    assert submitted.status_code == 202
+    assert http.get(submitted.headers["location"]).json()["capture"] == done["path"]
     refused = {"name": "fit", "options": {"held_out_cameras": ["cam_7"]}}
     refused = http.post("/jobs", json={"capture": done["id"], "pipeline": refused})
     assert "cam_7" in problem(refused, "bad-input")["detail"]
@@ -205,16 +207,16 @@ def test_devices_and_blackout(http, world):
 
 
 def snapshot(http: httpx.Client) -> dict[str, Any]:
-    answer: dict[str, Any] = http.get("/captures/snapshot").json()
-    return answer
+    taken: dict[str, Any] = http.get("/captures/snapshot").json()
+    return taken
 
 
 def test_without_devices_the_service_says_that_there_is_no_stage(rig_file, tmp_path):
     with serving(replace(rig_file, devices=None), tmp_path / "root") as http:
         for path in ("/captures", "/snapshot", "/queue"):
-            told = problem(http.post(path, json={}), "no-stage")
-            assert told["status"] == 409
-            assert "[devices] is missing" in told["detail"]
+            reported = problem(http.post(path, json={}), "no-stage")
+            assert reported["status"] == 409
+            assert "[devices] is missing" in reported["detail"]
         problem(http.post("/devices/blackout"), "no-stage")
         problem(http.get("/ready"), "not-ready")
         assert http.get("/health").json()["lamps_detail"] == "the rig file names no devices"
@@ -338,7 +340,7 @@ def read_events(http: httpx.Client, count: int, headers: dict[str, str]) -> list
     return events
 
 
-def test_events_are_numbered_and_replay_from_the_last_seen(http, server):
+def test_events_are_numbered_and_replay_from_the_last_event_id(http, server):
     done = capture_done(http, {"plan": SHORT})
     newest = server.service.events.last
     first = read_events(http, newest, {"Last-Event-ID": "0"})
@@ -517,8 +519,8 @@ def test_a_frame_that_is_gone_or_cut_is_damage_not_a_fault(http, server):
     lines = journal.read_text().splitlines()
     journal.write_text("\n".join([lines[0], lines[1][:40], *lines[2:]]) + "\n")
     assert "line 2" in problem(http.get(f"{frames}/3/cam_0.png"), "damaged-capture")["detail"]
-    asked = {"capture": done["id"], "pipeline": {"name": "reconstruct"}}
-    problem(http.post("/jobs", json=asked), "damaged-capture")
+    job_request = {"capture": done["id"], "pipeline": {"name": "reconstruct"}}
+    problem(http.post("/jobs", json=job_request), "damaged-capture")
 
 
 def test_jobs_need_a_capture_that_completed_and_a_model_of_their_own(http, world, server, head):
@@ -526,16 +528,16 @@ def test_jobs_need_a_capture_that_completed_and_a_model_of_their_own(http, world
         aborted = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
         http.post(f"/captures/{aborted}/abort")
     until(lambda: http.get(f"/captures/{aborted}").json()["state"] == "done")
-    asked = {"capture": aborted, "pipeline": {"name": "reconstruct"}}
-    assert "aborted" in problem(http.post("/jobs", json=asked), "not-finished")["detail"]
+    job_request = {"capture": aborted, "pipeline": {"name": "reconstruct"}}
+    assert "aborted" in problem(http.post("/jobs", json=job_request), "not-finished")["detail"]
     whole = capture_done(http, {"plan": SHORT})["id"]
-    asked = {"capture": whole, "pipeline": {"name": "reconstruct"}, "model": "shared"}
-    first = http.post("/jobs", json=asked)
+    job_request = {"capture": whole, "pipeline": {"name": "reconstruct"}, "model": "shared"}
+    first = http.post("/jobs", json=job_request)
     assert first.status_code == 202
-    again = problem(http.post("/jobs", json=asked), "model-in-use")
+    again = problem(http.post("/jobs", json=job_request), "model-in-use")
     assert first.json()["id"] in again["detail"]
-    assert http.post("/jobs", json={**asked, "model": "own"}).status_code == 202
+    assert http.post("/jobs", json={**job_request, "model": "own"}).status_code == 202
     http.delete(f"/jobs/{first.json()['id']}")
-    assert http.post("/jobs", json=asked).status_code == 202
+    assert http.post("/jobs", json=job_request).status_code == 202
     pages = [http.get("/jobs", params={"limit": 2, "offset": o}).json() for o in (0, 2)]
     assert [len(p) for p in pages] == [2, 1]

@@ -64,36 +64,36 @@ def http(truth: Rig, nominal: Rig, tmp_path: Path) -> Iterator[Callable[..., Cli
 
 
 def test_corners_are_where_the_camera_has_them(truth, http):
-    ask, prop, (camera, _) = http(0), board_pose(0, BOARD), truth.cameras
-    seen = ask.get("/captures/pose-0/board/cam_0").json()
-    assert (seen["lens"], seen["of"]) == ("nominal", 48)
-    assert seen["corners"] >= 30
+    client, prop, (camera, _) = http(0), board_pose(0, BOARD), truth.cameras
+    observed = client.get("/captures/pose-0/board/cam_0").json()
+    assert (observed["lens"], observed["of"]) == ("nominal", 48)
+    assert observed["corners"] >= 30
     tilt = np.degrees(np.arccos(abs((camera.R @ prop.rotation[:, 2])[2])))
-    assert seen["tilt_deg"] == pytest.approx(tilt, abs=2)
+    assert observed["tilt_deg"] == pytest.approx(tilt, abs=2)
     world = BOARD.corners @ prop.rotation.T + prop.translation
     true, _ = cv2.projectPoints(world, cv2.Rodrigues(camera.R)[0], camera.t, camera.K, None)
-    apart = np.linalg.norm(np.array(seen["pixels"])[:, None] - true[:, 0], axis=-1)
+    apart = np.linalg.norm(np.array(observed["pixels"])[:, None] - true[:, 0], axis=-1)
     assert apart.min(axis=1).max() < 0.5
-    rms = np.sqrt((np.array(seen["off"]) ** 2).sum(axis=1).mean())
-    assert seen["rms_px"] == pytest.approx(rms, abs=1e-3)
-    assert seen["rms_px"] < 0.2
-    none = ask.get("/captures/pose-0/board/cam_0?square_mm=9&marker_mm=12")
+    rms = np.sqrt((np.array(observed["off"]) ** 2).sum(axis=1).mean())
+    assert observed["rms_px"] == pytest.approx(rms, abs=1e-3)
+    assert observed["rms_px"] < 0.2
+    none = client.get("/captures/pose-0/board/cam_0?square_mm=9&marker_mm=12")
     assert slug(none) == "bad-input"
-    assert slug(ask.get("/captures/pose-0/board/cam_9")) == "unknown-frame"
-    assert slug(ask.get("/calibration/rig.json")) == "not-there"
-    assert slug(ask.post("/calibration", json={"boards": ["nope"]})) == "unknown-capture"
-    assert ask.get("/calibration").json()["state"] == "none"
+    assert slug(client.get("/captures/pose-0/board/cam_9")) == "unknown-frame"
+    assert slug(client.get("/calibration/rig.json")) == "not-there"
+    assert slug(client.post("/calibration", json={"boards": ["nope"]})) == "unknown-capture"
+    assert client.get("/calibration").json()["state"] == "none"
 
 
 def test_a_camera_that_the_calibrated_rig_lacks_is_shown_by_its_own_lens(truth, http, tmp_path):
-    ask = http(0)
+    client = http(0)
     calibrated = tmp_path / "root" / "calibration" / "rig.json"
     calibrated.parent.mkdir(exist_ok=True)
     one, other = truth.cameras
     for cameras in ((one,), (one, replace(other, width=other.width // 2))):
         calibrated.write_text(json.dumps(replace(truth, cameras=cameras).to_dict()))
         views = [
-            ask.get(f"/captures/pose-0/board/{c.name}?calibrated=true").json()
+            client.get(f"/captures/pose-0/board/{c.name}?calibrated=true").json()
             for c in truth.cameras
         ]
         assert [view["lens"] for view in views] == ["calibrated", "nominal"]
@@ -101,21 +101,25 @@ def test_a_camera_that_the_calibrated_rig_lacks_is_shown_by_its_own_lens(truth, 
 
 @pytest.mark.slow
 def test_the_rig_that_comes_of_it_and_why_none_does(truth, http, tmp_path):
-    ask = http(0, 1, 16)
+    client = http(0, 1, 16)
     body = {"boards": ["pose-0", "pose-1", "pose-16"], "keep_lens": True}
-    assert ask.post("/calibration", json=body).json()["state"] == "running"
-    view = until(lambda: v if (v := ask.get("/calibration").json())["state"] != "running" else None)
+    assert client.post("/calibration", json=body).json()["state"] == "running"
+    view = until(
+        lambda: v if (v := client.get("/calibration").json())["state"] != "running" else None
+    )
     assert (view["state"], view["error"]) == ("done", None)
     assert [stage["name"] for stage in view["stages"]] == ["cameras", "lights"]
-    (tmp_path / "found.json").write_text(ask.get("/calibration/rig.json").text)
+    (tmp_path / "found.json").write_text(client.get("/calibration/rig.json").text)
     found = load_rig_file(tmp_path / "found.json").rig
     apart = [np.linalg.norm(r.cameras[1].center - r.cameras[0].center) for r in (found, truth)]
     assert apart[0] == pytest.approx(apart[1], abs=0.002)
-    seen = ask.get("/captures/pose-0/board/cam_1?calibrated=true").json()
-    assert seen["lens"] == "calibrated"
+    observed = client.get("/captures/pose-0/board/cam_1?calibrated=true").json()
+    assert observed["lens"] == "calibrated"
 
-    ask.post("/calibration", json={"boards": ["pose-0"]})
-    view = until(lambda: v if (v := ask.get("/calibration").json())["state"] == "failed" else None)
+    client.post("/calibration", json={"boards": ["pose-0"]})
+    view = until(
+        lambda: v if (v := client.get("/calibration").json())["state"] == "failed" else None
+    )
     assert "cam_0: sees 8 or more corners of the board in 1" in view["error"]
     assert view["rig"], "that of before is still there"
 

@@ -120,7 +120,7 @@ def test_a_unix_socket_is_for_user_and_group(tmp_path):
     listening(unix=path).close()  # the one before has died
 
 
-def test_answers_leave_at_once():
+def test_responses_are_sent_at_once():
     """Without TCP_NODELAY the second of two small writes waits 40 ms for an acknowledgement."""
 
     async def accepted() -> int:
@@ -148,12 +148,12 @@ def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):
     own = resource.getrlimit(resource.RLIMIT_NOFILE)
     if own[1] < 4096:
         pytest.skip("this process may not open 1,224 connections")
-    with ExitStack() as stack, errors.open("w") as told:
+    with ExitStack() as stack, errors.open("w") as log:
         few = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))"
         service = subprocess.Popen(
             [sys.executable, "-c", f"{few}; os.execv(sys.argv[1], sys.argv[1:])", *command],
             stdout=subprocess.PIPE,
-            stderr=told,
+            stderr=log,
             text=True,
         )
         stack.callback(lambda: (service.kill(), service.wait(), service.stdout.close()))
@@ -173,7 +173,7 @@ def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):
 
 
 @pytest.mark.parametrize("host", ["::1", "[::1]"])
-def test_serve_answers_on_loopback_in_ipv6_by_names_in_any_case(rig_file, tmp_path, host):
+def test_serve_responds_on_ipv6_loopback_to_names_in_any_case(rig_file, tmp_path, host):
     command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
     command += ["--rig", str(rig_file.path), "--root", str(tmp_path / "root"), "--no-auth"]
     command += ["--host", host, "--name", "Stage-PC"]
@@ -198,7 +198,7 @@ def test_serve_answers_on_loopback_in_ipv6_by_names_in_any_case(rig_file, tmp_pa
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here")
-def test_serve_speaks_tls_and_nothing_else_where_it_has_a_certificate(rig_file, tmp_path):
+def test_serve_with_a_certificate_accepts_only_tls(rig_file, tmp_path):
     """The command itself, from its first line to SIGTERM."""
     key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
     made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"]

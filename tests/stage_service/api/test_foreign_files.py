@@ -13,11 +13,11 @@ from serving import slug
 SHORT = {"lights": ["light_003"], "projectors": []}
 
 
-def grown(ask) -> tuple[httpx.Response, float]:
+def grown(send) -> tuple[httpx.Response, float]:
     """An answer, and by how many MB client and service, one process here, grew meanwhile."""
-    answers: list[httpx.Response] = []
-    peak = bombs.peak_mb(lambda: answers.append(ask()))
-    return answers[0], peak
+    responses: list[httpx.Response] = []
+    peak = bombs.peak_mb(lambda: responses.append(send()))
+    return responses[0], peak
 
 
 def test_heads_and_masks_are_refused_by_what_they_unpack_to(http, tmp_path):
@@ -30,17 +30,17 @@ def test_heads_and_masks_are_refused_by_what_they_unpack_to(http, tmp_path):
         ("masks/cam_0.png", bombs.png(8, 6, data=text[11:-4]), "more data than these pixels"),
         ("masks/cam_0.png", bombs.png(0xEA60, 0xEA60, data=b""), "8x6 pixels, got 60000x60000"),
     ):
-        answer, peak = grown(lambda p=place, d=data: http.put(f"/uploads/s/{p}", content=d))
-        assert (answer.status_code, slug(answer)) == (422, "bad-input"), place
-        detail = answer.json()["detail"]
+        response, peak = grown(lambda p=place, d=data: http.put(f"/uploads/s/{p}", content=d))
+        assert (response.status_code, slug(response)) == (422, "bad-input"), place
+        detail = response.json()["detail"]
         assert detail.startswith(f"{place}")
         assert why in detail
         assert peak < 5 * len(data) / 1e6 + 40, place
     (tmp_path / "head.obj").write_bytes(bombs.obj(3_800_000))
     body = {"plan": SHORT, "head": str(tmp_path / "head.obj")}
-    answer, peak = grown(lambda: http.post("/captures", json=body))
-    assert slug(answer) == "bad-input"
-    assert answer.json()["detail"].startswith(f"head: {tmp_path / 'head.obj'}: 3,800,000 faces")
+    response, peak = grown(lambda: http.post("/captures", json=body))
+    assert slug(response) == "bad-input"
+    assert response.json()["detail"].startswith(f"head: {tmp_path / 'head.obj'}: 3,800,000 faces")
     assert peak < 40
     assert http.get("/captures").json() == []
 
@@ -53,24 +53,24 @@ def test_frames_that_somebody_put_there_are_shown_within_limits(http):
     frame = shot / "frames/00002/cam_0.exr"
     frame.write_bytes(bombs.exr(64, 16, claimed=(60_000, 60_000)))
     for kind in ("png", "json"):
-        answer, peak = grown(lambda k=kind: http.get(f"{url}.{k}"))
-        assert slug(answer) == "damaged-capture"
+        response, peak = grown(lambda k=kind: http.get(f"{url}.{k}"))
+        assert slug(response) == "damaged-capture"
         expected = f"{frame}: the image unpacks to 60000 × 60000 pixels; at most 160,000,000"
-        assert answer.json()["detail"].startswith(expected)
+        assert response.json()["detail"].startswith(expected)
         assert peak < 40
     frame.unlink()
     os.mkfifo(frame)
     assert slug(http.get(f"{url}.png")) == "damaged-capture"
     for other in shot.glob("frames/*/cam_1.exr"):
         other.write_bytes(bombs.exr(64, 16, claimed=(60_000, 60_000)))
-    answer, peak = grown(lambda: http.get(f"/captures/{capture}/board/cam_1"))
-    assert slug(answer) == "damaged-capture"
+    response, peak = grown(lambda: http.get(f"/captures/{capture}/board/cam_1"))
+    assert slug(response) == "damaged-capture"
     assert peak < 40
 
 
-def test_a_decoder_without_a_place_asks_for_patience(http):
+def test_a_full_decoder_responds_with_retry_after(http):
     capture = http.post("/captures", json={"plan": SHORT}).json()["id"]
     http.service._captures.wait(capture, 60)
     http.service.decoder.close()
-    answer = http.get(f"/captures/{capture}/frames/2/cam_0.png")
-    assert (answer.status_code, slug(answer)) == (503, "decoder-busy")
+    response = http.get(f"/captures/{capture}/frames/2/cam_0.png")
+    assert (response.status_code, slug(response)) == (503, "decoder-busy")

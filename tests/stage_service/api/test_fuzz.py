@@ -77,10 +77,10 @@ def fuzz(
         )
         @given(case=operation.as_strategy())
         def check(case: Any) -> None:
-            answer = case.call(base_url=url, headers=headers, timeout=600)
+            response = case.call(base_url=url, headers=headers, timeout=600)
             guarded = case.operation.definition.raw.get("security")
-            (others if guarded else for_all)[answer.status_code] += 1
-            case.validate_response(answer, checks=CHECKS)
+            (others if guarded else for_all)[response.status_code] += 1
+            case.validate_response(response, checks=CHECKS)
 
         check()
     return for_all, others
@@ -103,6 +103,6 @@ def test_a_few_requests_of_every_kind(live, who):
 def test_ten_thousand_requests(live, who, capsys):
     headers = {"Authorization": f"Bearer {OWN}"} if who == "token" else {}
     found = fuzz(live, LARGE, headers, 2)
-    answers = found[0] + found[1]
+    responses = found[0] + found[1]
     with capsys.disabled():
-        print(f"\n{who}: {answers.total()} requests: {dict(sorted(answers.items()))}")
+        print(f"\n{who}: {responses.total()} requests: {dict(sorted(responses.items()))}")

@@ -65,17 +65,17 @@ def tokens(tmp_path: Path) -> Tokens:
 
 
 @pytest.fixture
-def ask(service: Service, tokens: Tokens) -> Callable[..., httpx.Response]:
+def call(service: Service, tokens: Tokens) -> Callable[..., httpx.Response]:
     """`ask("GET /captures", token, …)`"""
     app = create_app(service, Access(tokens))
 
-    def ask(what: str, token: str | None = None, **more: Any) -> httpx.Response:
+    def call(what: str, token: str | None = None, **more: Any) -> httpx.Response:
         headers = more.pop("headers", {})
         if token is not None:
             headers["Authorization"] = f"Bearer {token}"
         return send(app, what, headers, **more)
 
-    return ask
+    return call
 
 
 def done(service: Service) -> list[tuple[str, str]]:
@@ -83,9 +83,9 @@ def done(service: Service) -> list[tuple[str, str]]:
     return [(a.who.split(" ")[0], a.action) for a in service.audit(1000) if a.result != "refused"]
 
 
-def test_every_route_asks_for_a_token(ask, service):
-    document = ask("GET /openapi.json").json()
-    assert ask("GET /docs").status_code == ask("GET /docs/errors.md").status_code == 200
+def test_every_route_requires_a_token(call, service):
+    document = call("GET /openapi.json").json()
+    assert call("GET /docs").status_code == call("GET /docs/errors.md").status_code == 200
     routes = [(m, path, op) for path, ops in document["paths"].items() for m, op in ops.items()]
     assert len(routes) > 20
     for method, path, operation in routes:
@@ -93,48 +93,48 @@ def test_every_route_asks_for_a_token(ask, service):
             continue
         assert operation["security"], path
         for token in (None, "guessed", ""):
-            refused(ask(f"{method.upper()} {path}", token), "unauthorized", 401)
-    assert ask("GET /captures").headers["www-authenticate"] == "Bearer"
+            refused(call(f"{method.upper()} {path}", token), "unauthorized", 401)
+    assert call("GET /captures").headers["www-authenticate"] == "Bearer"
     assert done(service) == []
 
 
 @pytest.mark.parametrize("scope", SCOPES)
-def test_a_token_opens_what_its_scope_says(ask, tokens, scope):
+def test_a_token_opens_what_its_scope_says(call, tokens, scope):
     token = tokens.make("x", (scope,))
     for what in (w for w in SEE if w != "GET /events"):
         if scope == "read":
-            assert ask(what, token, json={}).status_code == 200
+            assert call(what, token, json={}).status_code == 200
         else:
-            assert refused(ask(what, token, json={}), "forbidden", 403)["scope"] == "read"
+            assert refused(call(what, token, json={}), "forbidden", 403)["scope"] == "read"
     for what, needed in NEEDS.items():
-        status = ask(what, token, json={}).status_code
+        status = call(what, token, json={}).status_code
         assert (status == 403) == (scope != needed), (what, status)
-    refused(ask("POST /captures/x/abort", token), "unknown-capture", 404)
-    assert ask("POST /devices/blackout", token).json()["state"] == "dark"
+    refused(call("POST /captures/x/abort", token), "unknown-capture", 404)
+    assert call("POST /devices/blackout", token).json()["state"] == "dark"
 
 
-def test_arming_and_pipelines_need_scopes_of_their_own(ask, tokens):
+def test_arming_and_pipelines_need_scopes_of_their_own(call, tokens):
     token = tokens.make("x", ("read", "steer"))
     armed = {"armed_by": "Ada", "plan": {"lights": ["nope"]}}
-    assert refused(ask("POST /captures", token, json=armed), "forbidden", 403)["scope"] == "arm"
+    assert refused(call("POST /captures", token, json=armed), "forbidden", 403)["scope"] == "arm"
     then = {"pipeline": {"name": "light_planes"}}
-    assert refused(ask("POST /captures", token, json=then), "forbidden", 403)["scope"] == "jobs"
-    again = ask("POST /captures/x/resume", token, json={"armed_by": "Ada"})
+    assert refused(call("POST /captures", token, json=then), "forbidden", 403)["scope"] == "jobs"
+    again = call("POST /captures/x/resume", token, json={"armed_by": "Ada"})
     assert refused(again, "forbidden", 403)["scope"] == "arm"
 
 
-def test_the_audit_has_whose_token_it_was(ask, tokens):
+def test_the_audit_has_whose_token_it_was(call, tokens):
     everything, other = tokens.make("ada", SCOPES), tokens.make("bob", ("steer",))
-    assert ask("POST /lease", other, json={"holder": "Bob", "seconds": 60}).status_code == 201
-    refused(ask("DELETE /lease", everything), "no-lease", 409)
-    assert ask("DELETE /lease?force=true", everything).json()["holder"] is None
-    refused(ask("DELETE /jobs/x", everything), "unknown-job", 404)
+    assert call("POST /lease", other, json={"holder": "Bob", "seconds": 60}).status_code == 201
+    refused(call("DELETE /lease", everything), "no-lease", 409)
+    assert call("DELETE /lease?force=true", everything).json()["holder"] is None
+    refused(call("DELETE /jobs/x", everything), "unknown-job", 404)
     job = {"capture": "x", "pipeline": {"name": "fit"}}
-    refused(ask("POST /jobs", everything, json=job), "unknown-capture", 404)
-    ask("POST /devices/blackout", other)
+    refused(call("POST /jobs", everything, json=job), "unknown-capture", 404)
+    call("POST /devices/blackout", other)
     found = [
         (a["who"].split(" ")[0], a["action"], a["result"])
-        for a in ask("GET /audit", everything).json()
+        for a in call("GET /audit", everything).json()
     ]
     assert found == [
         ("bob", "lease.take", "ok"),
@@ -146,11 +146,11 @@ def test_the_audit_has_whose_token_it_was(ask, tokens):
     ]
 
 
-def test_a_token_that_is_revoked_opens_nothing_any_more(ask, tmp_path, capsys):
+def test_a_token_that_is_revoked_opens_nothing_any_more(call, tmp_path, capsys):
     root = ["--root", str(tmp_path / "root")]
     assert main(["token", "make", "ada", "--scopes", "read", *root]) == 0
     token = capsys.readouterr().out.strip()
-    assert ask("GET /lease", token).status_code == 200
+    assert call("GET /lease", token).status_code == 200
     file = tmp_path / "root" / "tokens.json"
     assert token not in file.read_text()
     assert file.stat().st_mode & 0o777 == 0o600
@@ -160,20 +160,20 @@ def test_a_token_that_is_revoked_opens_nothing_any_more(ask, tmp_path, capsys):
     assert main(["token", "make", "ada", *root]) == 3
     assert main(["token", "make", "bob", "--scopes", "read,everything", *root]) == 3
     assert main(["token", "revoke", "ada", *root]) == 0
-    refused(ask("GET /lease", token), "unauthorized", 401)
+    refused(call("GET /lease", token), "unauthorized", 401)
     assert main(["token", "revoke", "ada", *root]) == 3
-    actions = [(a["action"], a["subject"]) for a in ask("GET /audit", "mine").json()]
+    actions = [(a["action"], a["subject"]) for a in call("GET /audit", "mine").json()]
     assert actions == [("token.make", "ada"), ("token.revoke", "ada")]
 
 
-def test_a_damaged_file_of_tokens_opens_nothing(ask, tokens, tmp_path):
+def test_a_damaged_file_of_tokens_opens_nothing(call, tokens, tmp_path):
     token = tokens.make("ada", SCOPES)
     for text in ("", "[", '[{"name": "ada"}]', '{"a": 1}', "[1]", "[" * 10**5):
         (tmp_path / "root" / "tokens.json").write_text(text)
-        refused(ask("GET /lease", token), "unauthorized", 401)
+        refused(call("GET /lease", token), "unauthorized", 401)
         with pytest.raises(TokenError, match=r"tokens\.json"):
             tokens.make("bob", ())
-    assert ask("GET /lease", "mine").status_code == 200  # of whoever runs the service
+    assert call("GET /lease", "mine").status_code == 200  # of whoever runs the service
 
 
 def test_an_empty_file_of_one_s_own_token_opens_nothing(service, tmp_path, monkeypatch, capsys):
@@ -187,7 +187,7 @@ def test_an_empty_file_of_one_s_own_token_opens_nothing(service, tmp_path, monke
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "x"])
-def test_a_page_of_another_site_asks_in_vain(service, origin):
+def test_requests_of_another_site_are_refused(service, origin):
     """Also where no token is asked for: a browser sends the request, whoever made the page."""
     app = create_app(service)
     headers = {"Origin": origin, "Content-Type": "text/plain"}
@@ -199,13 +199,13 @@ def test_a_page_of_another_site_asks_in_vain(service, origin):
     assert done(service) == [("127.0.0.1:123", "blackout")]
 
 
-def test_listeners_leave_places_for_requests(ask, tokens, monkeypatch):
+def test_listeners_leave_places_for_requests(call, tokens, monkeypatch):
     none = dataclasses.replace(places.LIMITS["streams"], all=0)
     monkeypatch.setitem(places.LIMITS, "streams", none)
-    assert "event streams" in refused(ask("GET /events", "mine"), "no-place", 503)["detail"]
+    assert "event streams" in refused(call("GET /events", "mine"), "no-place", 503)["detail"]
 
 
-def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
+def test_a_request_is_no_larger_than_it_need_be(call, tokens):
     token = tokens.make("ada", SCOPES)
 
     async def long() -> AsyncIterator[bytes]:
@@ -213,22 +213,24 @@ def test_a_request_is_no_larger_than_it_need_be(ask, tokens):
             yield b"a" * 1000
 
     for content in (long(), b"a" * (bodies.MOST_BODY + 1)):
-        refused(ask("POST /captures", token, content=content), "too-large", 413)
+        refused(call("POST /captures", token, content=content), "too-large", 413)
     names = [f"x{i}" for i in range(4097)]
     for plan in ({"lights": names}, {"projectors": names}, {"lights": ["x" * 101]}):
-        refused(ask("POST /plans:validate", token, json=plan), "invalid-request", 422)
+        refused(call("POST /plans:validate", token, json=plan), "invalid-request", 422)
     plan = {"lights": [*names[1:4000], "x1"]}
-    told = refused(ask("POST /plans:validate", token, json=plan), "invalid-plan", 422)["problems"]
-    assert (len(told), told[-1]) == (21, "lights: 3981 more such names")
+    reported = refused(call("POST /plans:validate", token, json=plan), "invalid-plan", 422)[
+        "problems"
+    ]
+    assert (len(reported), reported[-1]) == (21, "lights: 3981 more such names")
 
 
-def test_a_job_submitted_twice_under_one_key_is_one_job(ask, tokens, service, monkeypatch):
+def test_a_job_submitted_twice_under_one_key_is_one_job(call, tokens, service, monkeypatch):
     submitted = []
 
     def submit(job: str, _request: Any) -> Any:
         submitted.append(job)
-        asked, model = PipelineRequest(name="fit"), Model(service.root / "models" / job)
-        return service._queue.submit(asked, service.root / "captures" / "x", model, job=job)
+        requested, model = PipelineRequest(name="fit"), Model(service.root / "models" / job)
+        return service._queue.submit(requested, service.root / "captures" / "x", model, job=job)
 
     monkeypatch.setattr(service.jobs, "_submit", submit)
     app = create_app(service)
@@ -247,11 +249,11 @@ def test_a_token_that_is_revoked_ends_what_follows_the_events(rig_file, tmp_path
     headers = {"Authorization": f"Bearer {tokens.make('ada', ('read',))}"}
     with (
         serving(rig_file, tmp_path, access) as http,
-        http.stream("GET", "/events?after=0", headers=headers) as answer,
+        http.stream("GET", "/events?after=0", headers=headers) as response,
     ):
-        assert answer.status_code == 200
+        assert response.status_code == 200
         http.service.events.publish("test", {})
-        lines = answer.iter_lines()
+        lines = response.iter_lines()
         assert any(line.startswith("event: test") for line in lines)
         tokens.revoke("ada")
         for _ in lines:  # it ends
@@ -274,56 +276,56 @@ def test_tokens_that_are_made_at_the_same_time_are_all_there(tmp_path):
     assert len(Tokens(tmp_path / "tokens.json").entries()) == 30
 
 
-def test_a_browser_that_logs_in_needs_no_token_any_more(ask, tokens, service):
+def test_a_browser_that_logs_in_needs_no_token_any_more(call, tokens, service):
     token = tokens.make("ada", ("read", "steer"))
-    refused(ask("POST /login", json={"token": "guessed"}), "unauthorized", 401)
-    refused(ask("POST /login", json={}), "invalid-request", 422)
-    answer = ask("POST /login", json={"token": token})
-    assert answer.json()["name"] == "ada"
-    assert answer.json()["scopes"] == ["read", "steer"]
-    cookie, *rules = answer.headers["set-cookie"].split("; ")
+    refused(call("POST /login", json={"token": "guessed"}), "unauthorized", 401)
+    refused(call("POST /login", json={}), "invalid-request", 422)
+    response = call("POST /login", json={"token": token})
+    assert response.json()["name"] == "ada"
+    assert response.json()["scopes"] == ["read", "steer"]
+    cookie, *rules = response.headers["set-cookie"].split("; ")
     assert rules == ["Path=/", "Max-Age=43200", "HttpOnly", "SameSite=Strict"]
     assert token not in cookie
     logged_in = {"headers": {"Cookie": f"theme=dark; {cookie}"}}
-    assert ask("GET /login", **logged_in).json()["name"] == "ada"
-    assert ask("GET /captures", **logged_in).status_code == 200
-    refused(ask("POST /jobs", json={}, **logged_in), "forbidden", 403)
+    assert call("GET /login", **logged_in).json()["name"] == "ada"
+    assert call("GET /captures", **logged_in).status_code == 200
+    refused(call("POST /jobs", json={}, **logged_in), "forbidden", 403)
     for header in (f"{cookie}x", cookie.partition("=")[0], f"hairstage={token}", "=;;"):
-        refused(ask("GET /captures", headers={"Cookie": header}), "unauthorized", 401)
+        refused(call("GET /captures", headers={"Cookie": header}), "unauthorized", 401)
     assert done(service) == [("ada", "login")]
 
 
-def test_a_login_ends_with_logout_revocation_and_time(ask, tokens, monkeypatch):
+def test_a_login_ends_with_logout_revocation_and_time(call, tokens, monkeypatch):
     tokens.make("ada", ("read",))
     bob = tokens.make("bob", ("read",))
 
     def log_in(token: str) -> dict[str, Any]:
-        cookie = ask("POST /login", json={"token": token}).headers["set-cookie"].partition(";")[0]
+        cookie = call("POST /login", json={"token": token}).headers["set-cookie"].partition(";")[0]
         return {"headers": {"Cookie": cookie}}
 
     first, second = log_in("mine"), log_in("mine")
-    answer = ask("POST /logout", **first)
-    assert "=; Path=/; Max-Age=0;" in answer.headers["set-cookie"]
-    refused(ask("GET /captures", **first), "unauthorized", 401)
-    assert ask("GET /captures", **second).status_code == 200
+    response = call("POST /logout", **first)
+    assert "=; Path=/; Max-Age=0;" in response.headers["set-cookie"]
+    refused(call("GET /captures", **first), "unauthorized", 401)
+    assert call("GET /captures", **second).status_code == 200
     third = log_in(bob)
-    assert ask("GET /captures", **third).status_code == 200
+    assert call("GET /captures", **third).status_code == 200
     tokens.revoke("bob")
-    refused(ask("GET /captures", **third), "unauthorized", 401)
+    refused(call("GET /captures", **third), "unauthorized", 401)
     monkeypatch.setattr(logins, "LASTS_S", 0.0)
-    refused(ask("GET /captures", **log_in("mine")), "unauthorized", 401)
+    refused(call("GET /captures", **log_in("mine")), "unauthorized", 401)
 
 
 def test_a_login_over_tls_stays_there_and_each_port_has_its_own(service, tokens):
     app = create_app(service, Access(tokens))
 
     def log_in(url: str) -> str:
-        async def answer() -> str:
+        async def response() -> str:
             async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=url) as http:
                 sent = await http.post("/login", json={"token": "mine"}, headers={"Origin": url})
                 return sent.headers["set-cookie"]
 
-        return asyncio.run(answer())
+        return asyncio.run(response())
 
     name, _, rules = log_in("https://127.0.0.1").partition("=")
     assert (name, rules[-8:]) == ("__Host-hairstage", "; Secure")
@@ -331,13 +333,13 @@ def test_a_login_over_tls_stays_there_and_each_port_has_its_own(service, tokens)
     assert names == ["hairstage-8331", "hairstage-8332"]
 
 
-def test_a_page_of_another_site_logs_nobody_in(ask, service):
+def test_a_page_of_another_site_logs_nobody_in(call, service):
     foreign = {"Origin": "http://evil.example"}
-    refused(ask("POST /login", json={"token": "mine"}, headers=foreign), "foreign-origin", 403)
+    refused(call("POST /login", json={"token": "mine"}, headers=foreign), "foreign-origin", 403)
     assert done(service) == []
 
 
-def test_where_nobody_is_asked_for_a_token_a_login_sets_no_cookie(service):
-    answer = send(create_app(service), "POST /login", {}, json={"token": "any"})
-    assert answer.json() == {"name": "", "scopes": list(SCOPES), "blackout": None}
-    assert "set-cookie" not in answer.headers
+def test_without_required_tokens_a_login_sets_no_cookie(service):
+    response = send(create_app(service), "POST /login", {}, json={"token": "any"})
+    assert response.json() == {"name": "", "scopes": list(SCOPES), "blackout": None}
+    assert "set-cookie" not in response.headers

@@ -51,8 +51,8 @@ def filled(http: Client) -> Client:
     """A service with a capture, a job whose model has files, an upload, something in the trash."""
     shot = http.post("/captures", json={"plan": SHORT}).json()["id"]
     http.service._captures.wait(shot, 60)
-    asked = {"capture": shot, "pipeline": {"name": "reconstruct"}, "model": "m"}
-    job = http.post("/jobs", json=asked).json()["id"]
+    requested = {"capture": shot, "pipeline": {"name": "reconstruct"}, "model": "m"}
+    job = http.post("/jobs", json=requested).json()["id"]
     model = Model(http.service.root / "models" / "m").create()
     for name, data in (("index.html", b"<p>"), ("report.json", b"{}"), ("relit.png", PNG)):
         model.file(name).write_bytes(data)
@@ -70,7 +70,7 @@ def paths(routers: Iterable[Any]) -> Iterator[tuple[str, str]]:
             yield from paths(inner.routes)
 
 
-def test_every_route_answers_with_safe_headers(filled):
+def test_every_route_sends_safe_headers(filled):
     """With what there is, and with nothing: an answer, a refusal and a fault have them alike."""
     known = sorted(paths(create_app(filled.service).routes))  # GET comes before all but DELETE
     known.sort(key=lambda route: route[0] != "GET")
@@ -79,33 +79,33 @@ def test_every_route_answers_with_safe_headers(filled):
     for method, path in known:
         url = re.sub(r"{(\w+)(:path)?}", lambda m: PARTS.get(m[1], "none"), path)
         url = url.replace("/web/m", "/web/main.js")
-        with filled.stream(method, url) as answer:
-            got[method, path] = answer.status_code
-            safe(answer, url)
+        with filled.stream(method, url) as reply:
+            got[method, path] = reply.status_code
+            safe(reply, url)
     reads = [status for (method, _), status in got.items() if method == "GET"]
     assert reads.count(200) > 0.7 * len(reads), got
 
 
-def safe(answer: httpx.Response, url: str) -> None:
-    told = answer.headers
-    assert told["x-content-type-options"] == "nosniff", url
-    assert told["referrer-policy"] == "no-referrer", url
-    assert told["cross-origin-resource-policy"] == "same-origin", url
-    limits = directives(answer)
+def safe(reply: httpx.Response, url: str) -> None:
+    reported = reply.headers
+    assert reported["x-content-type-options"] == "nosniff", url
+    assert reported["referrer-policy"] == "no-referrer", url
+    assert reported["cross-origin-resource-policy"] == "same-origin", url
+    limits = directives(reply)
     assert limits["default-src"] == limits["base-uri"] == limits["form-action"] == "'none'", url
     assert limits["frame-ancestors"] == "'none'", url
-    if answer.status_code == 200 and OURS.match(url):
-        assert told["cache-control"] == "no-cache", url
-        assert "unsafe" not in told["content-security-policy"], url
+    if reply.status_code == 200 and OURS.match(url):
+        assert reported["cache-control"] == "no-cache", url
+        assert "unsafe" not in reported["content-security-policy"], url
         assert limits["script-src"] == limits["style-src"] == "'self'", url
     else:
-        assert told["cache-control"] == "private, no-store", url
+        assert reported["cache-control"] == "private, no-store", url
         assert "sandbox" in limits, url
         assert "allow-scripts" not in limits["sandbox"], url
         assert "script-src" not in limits, url
-        kind = told.get("content-type", "").partition(";")[0]
+        kind = reported.get("content-type", "").partition(";")[0]
         report = url.endswith("/index.html")
-        attached = told.get("content-disposition", "").startswith("attachment")
+        attached = reported.get("content-disposition", "").startswith("attachment")
         assert kind in HARMLESS or report or attached, (url, kind)
 
 
@@ -128,14 +128,14 @@ def test_a_new_route_is_safe_by_itself_whatever_it_says_of_caching():
 
 def test_refusals_have_them_too(rig_file, tmp_path):
     with serving(rig_file, tmp_path / "root", Access(Tokens(tmp_path / "t", "own"))) as http:
-        for answer, status in (
+        for reply, status in (
             (http.get("/captures"), 401),
             (http.get("/", headers={"Host": "elsewhere"}), 421),
             (http.post("/login", json={}, headers={"Origin": "http://elsewhere"}), 403),
             (http.post("/login", content=bytes(2 << 20)), 413),
         ):
-            assert answer.status_code == status
-            safe(answer, "/refused")
+            assert reply.status_code == status
+            safe(reply, "/refused")
 
 
 FILES = {
@@ -160,19 +160,19 @@ def test_files_of_a_model_are_shown_only_where_they_are_what_they_are_called(fil
         file = filled.service.root / "models" / "m" / name
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(data)
-        answer = filled.get(f"/jobs/{PARTS['job']}/artifacts/{name}")
-        assert answer.content == data
-        safe(answer, "/artifact")
-        told = answer.headers["content-type"], answer.headers.get("content-disposition")
+        reply = filled.get(f"/jobs/{PARTS['job']}/artifacts/{name}")
+        assert reply.content == data
+        safe(reply, "/artifact")
+        reported = reply.headers["content-type"], reply.headers.get("content-disposition")
         saved = "application/octet-stream", attachment(Path(name).name)
-        assert told == (saved if kind is None else (kind, None)), name
+        assert reported == (saved if kind is None else (kind, None)), name
 
 
 def test_the_page_of_a_model_shows_its_own_pictures_alone_and_runs_nothing(filled):
     url = f"/jobs/{PARTS['job']}/artifacts/index.html"
-    answer = filled.get(url)
-    assert answer.headers["content-type"] == "text/html; charset=utf-8"
-    limits, host = directives(answer), filled.base_url.netloc.decode()
+    reply = filled.get(url)
+    assert reply.headers["content-type"] == "text/html; charset=utf-8"
+    limits, host = directives(reply), filled.base_url.netloc.decode()
     assert limits["img-src"] == f"{host}{url.removesuffix('index.html')} data:"
     assert limits["sandbox"] == "allow-same-origin allow-downloads"
     six = filled.get(url, headers={"Host": "[::1]:80"})
@@ -180,8 +180,8 @@ def test_the_page_of_a_model_shows_its_own_pictures_alone_and_runs_nothing(fille
 
 
 def test_a_name_in_a_header_is_a_name_and_nothing_else():
-    told = attachment('a"b\r\nSet-Cookie: x=1\\é.tar')
-    assert "\r" not in told
-    assert "\n" not in told
-    assert told.count('"') == 2
-    assert told.endswith("filename*=UTF-8''a%22b%0D%0ASet-Cookie%3A%20x%3D1%5C%C3%A9.tar")
+    reported = attachment('a"b\r\nSet-Cookie: x=1\\é.tar')
+    assert "\r" not in reported
+    assert "\n" not in reported
+    assert reported.count('"') == 2
+    assert reported.endswith("filename*=UTF-8''a%22b%0D%0ASet-Cookie%3A%20x%3D1%5C%C3%A9.tar")

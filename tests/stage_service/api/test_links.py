@@ -44,23 +44,23 @@ def test_a_model_that_is_a_link_is_listed_with_where_it_leads_and_not_read(http,
     capture = shot(http).name
     place = link(http, "models/linked", outside)
     link(http, "models/broken", "/nowhere")
-    told = {m["name"]: m for m in http.get("/models").json()}
-    assert told["linked"] == {
+    reported = {m["name"]: m for m in http.get("/models").json()}
+    assert reported["linked"] == {
         **{"name": "linked", "files": [], "bytes": 0, "link": str(outside), "outside": []}
     }
-    assert told["broken"]["link"] == "/nowhere"
-    asked = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "linked"}
-    answers = [
+    assert reported["broken"]["link"] == "/nowhere"
+    requested = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "linked"}
+    responses = [
         http.get("/models/linked/archive.tar"),
         http.get("/models/broken/archive.tar"),
         http.get("/view/models/linked"),
-        http.post("/jobs", json=asked),
+        http.post("/jobs", json=requested),
     ]
-    for answer in answers:
-        assert (answer.status_code, slug(answer)) == (409, "leads-outside")
-        assert SECRET not in answer.content
-    assert f"the model linked is a link to {outside}" in answers[0].json()["detail"]
-    job = http.post("/jobs", json={**asked, "model": "plain"}).json()["id"]
+    for response in responses:
+        assert (response.status_code, slug(response)) == (409, "leads-outside")
+        assert SECRET not in response.content
+    assert f"the model linked is a link to {outside}" in responses[0].json()["detail"]
+    job = http.post("/jobs", json={**requested, "model": "plain"}).json()["id"]
     Model(http.service.root / "models" / "plain")
     link(http, "models/plain", outside)  # after the job was taken
     for path in ("artifacts", "artifacts/passwd", "artifacts/index.html", "report"):
@@ -75,14 +75,14 @@ def test_links_in_a_model_that_lead_out_of_it_are_named_and_not_read(http, outsi
     link(http, "models/m/plots", outside)
     link(http, "models/m/same.npz", "strands.npz")
     link(http, "models/m/loop", ".")
-    (told,) = http.get("/models").json()
-    assert told["outside"] == [f"plots -> {outside}", f"relit.png -> {outside / 'passwd'}"]
-    assert "relit.png" not in told["files"]
+    (reported,) = http.get("/models").json()
+    assert reported["outside"] == [f"plots -> {outside}", f"relit.png -> {outside / 'passwd'}"]
+    assert "relit.png" not in reported["files"]
     for path in ("/models/m/archive.tar", "/view/models/m"):
-        answer = http.get(path)
-        assert slug(answer) == "leads-outside"
-        assert SECRET not in answer.content
-        assert str(outside) in answer.json()["detail"]
+        response = http.get(path)
+        assert slug(response) == "leads-outside"
+        assert SECRET not in response.content
+        assert str(outside) in response.json()["detail"]
     for name in ("relit.png", "plots"):
         (model.path / name).unlink()
     archive = http.get("/models/m/archive.tar")
@@ -100,12 +100,12 @@ def test_a_capture_that_is_a_link_is_listed_and_removed_as_one(rig_file, tmp_pat
         link(http, "captures/20200101-000000-gone", "/nowhere")
         link(http, "captures/etc", outside)
     with serving(rig_file, root) as http:  # and as a service finds them that has an index
-        told = {c["id"]: c for c in http.get("/captures").json()}
+        reported = {c["id"]: c for c in http.get("/captures").json()}
         leads = {"20200101-000000-away": moved, "20200101-000000-same": real.name}
         leads |= {"20200101-000000-gone": "/nowhere", "etc": outside}
         for name, to in leads.items():
-            assert told[name]["outcome"] == "damaged"
-            assert f"is a link to {to}" in told[name]["error"]
+            assert reported[name]["outcome"] == "damaged"
+            assert f"is a link to {to}" in reported[name]["error"]
             for path in ("archive.tar", "steps", "frames/2/cam_0.exr", "frames/2/cam_0.png"):
                 assert slug(http.get(f"/captures/{name}/{path}")) == "leads-outside", path
             removed = http.delete(f"/captures/{name}").json()
@@ -165,9 +165,9 @@ def test_what_cannot_be_deleted_is_named_and_the_younger_goes(http, monkeypatch)
         delete(path)
 
     monkeypatch.setattr(trash, "remove", remove)
-    answer = http.delete("/trash", params={"older_than_days": 0})
-    assert (answer.status_code, slug(answer)) == (409, "not-removed")
-    (problem,) = answer.json()["problems"]
+    response = http.delete("/trash", params={"older_than_days": 0})
+    assert (response.status_code, slug(response)) == (409, "not-removed")
+    (problem,) = response.json()["problems"]
     assert problem.startswith(f"{old['name']} (model old)")
     assert "Permission denied" in problem
     (left,) = http.get("/trash").json()
@@ -195,17 +195,17 @@ def test_whatever_a_crash_left_in_the_trash_is_listed_and_goes(http, outside):
     evil.mkdir()
     record = {"name": None, "kind": "model", "id": "..", "by": "", "removed": "2020", "bytes": 0}
     (evil / "removed.json").write_text(json.dumps(record))
-    told = {r["name"]: r for r in http.get("/trash").json()}
-    assert len(told) == 7
-    assert told[places["moved"].name]["problem"].startswith("its files are not here")
-    assert told[places["halved"].name]["problem"] == "its deletion was interrupted"
-    assert told["link"]["link"] == str(outside)
+    reported = {r["name"]: r for r in http.get("/trash").json()}
+    assert len(reported) == 7
+    assert reported[places["moved"].name]["problem"].startswith("its files are not here")
+    assert reported[places["halved"].name]["problem"] == "its deletion was interrupted"
+    assert reported["link"]["link"] == str(outside)
     for name in ("empty", "link", "file", "evil", places["unread"].name):
-        assert told[name]["kind"] == "unknown"
-    for name in told:
-        answer = http.post(f"/trash/{name}/restore")
-        assert slug(answer) == "not-there"
-        assert "cannot be restored" in answer.json()["detail"]
+        assert reported[name]["kind"] == "unknown"
+    for name in reported:
+        response = http.post(f"/trash/{name}/restore")
+        assert slug(response) == "not-there"
+        assert "cannot be restored" in response.json()["detail"]
     assert len(http.delete("/trash", params={"older_than_days": 0}).json()) == 7
     assert list((root / "trash").iterdir()) == []
     assert (outside / "passwd").read_bytes() == SECRET
@@ -214,8 +214,8 @@ def test_whatever_a_crash_left_in_the_trash_is_listed_and_goes(http, outside):
 def test_the_archive_of_a_capture_whose_folder_has_gone_is_an_error(http, tmp_path):
     place = shot(http)
     place.rename(tmp_path / "gone")
-    answer = http.get(f"/captures/{place.name}/archive.tar")
-    assert (answer.status_code, slug(answer)) == (409, "damaged-capture")
-    assert str(place) in answer.json()["detail"]
+    response = http.get(f"/captures/{place.name}/archive.tar")
+    assert (response.status_code, slug(response)) == (409, "damaged-capture")
+    assert str(place) in response.json()["detail"]
     (tmp_path / "gone").rename(place)
     assert http.get(f"/captures/{place.name}/archive.tar").status_code == 200

@@ -39,13 +39,13 @@ SHORT = {"plan": {"lights": ["light_003"], "projectors": []}}
 def flood(http: Client, *request: Any, count: int = THREADS, **more: Any) -> None:
     """Send a request so many times at once, and wait for no answer."""
 
-    def ask() -> None:
+    def start_capture() -> None:
         own = httpx.Client(base_url=http.base_url, timeout=120, trust_env=False)
         with own, suppress(httpx.HTTPError):
             own.request(*request, **more)
 
     for _ in range(count):
-        threading.Thread(target=ask, daemon=True).start()
+        threading.Thread(target=start_capture, daemon=True).start()
 
 
 @contextmanager
@@ -79,8 +79,8 @@ def assert_it_can_be_darkened(http: Client, world: Any, capture: str | None) -> 
     assert http.get("/health").status_code == 200
     if capture is not None:
         assert http.post(f"/captures/{capture}/abort").status_code in (200, 409)
-    answer = http.post("/devices/blackout").json()
-    assert (answer["state"], world.lit, world.show) == ("dark", set(), "OFF")
+    response = http.post("/devices/blackout").json()
+    assert (response["state"], world.lit, world.show) == ("dark", set(), "OFF")
 
 
 def test_while_every_request_that_may_be_at_work_waits(rig_file, world, tmp_path, monkeypatch):
@@ -94,7 +94,7 @@ def test_while_every_request_that_may_be_at_work_waits(rig_file, world, tmp_path
         assert_it_can_be_darkened(http, world, capture)
 
 
-def test_while_the_job_database_never_answers(rig_file, world, tmp_path, monkeypatch):
+def test_while_the_job_database_never_responds(rig_file, world, tmp_path, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         url = f"postgresql://nobody@127.0.0.1:{deaf.getsockname()[1]}/x?connect_timeout=600"
         monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", url)
@@ -110,7 +110,7 @@ def test_while_the_job_database_never_answers(rig_file, world, tmp_path, monkeyp
         deaf.close()
 
 
-def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, world, tmp_path):
+def test_while_cameras_hang_and_many_clients_query_the_devices(rig_file, world, tmp_path):
     assert rig_file.devices is not None
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         port = deaf.getsockname()[1]
@@ -118,14 +118,14 @@ def test_while_cameras_hang_and_everybody_asks_how_the_devices_are(rig_file, wor
         devices = rig_file.devices.model_copy(update={"cameras": cameras})
         with serving(replace(rig_file, devices=devices), tmp_path) as http:
             flood(http, "GET", "/devices")
-            seen = http.get("/devices").json()
-            assert seen["age_s"] is None
-            assert seen["cameras"]["cam_0"]["state"] == "not queried yet"
+            observed = http.get("/devices").json()
+            assert observed["age_s"] is None
+            assert observed["cameras"]["cam_0"]["state"] == "not queried yet"
             world.lit = {3}
             assert_it_can_be_darkened(http, world, None)
 
 
-def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
+def test_while_the_lights_hang_blackout_reports_it_and_darkens_the_projectors(
     rig_file, world, tmp_path, monkeypatch
 ):
     with serving(rig_file, tmp_path) as http:
@@ -138,9 +138,9 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
             until(lambda: http.get("/health").json()["lamps"] == "unknown, unsafe")
             events = http.service.events.after
             until(lambda: any("under way" in str(e.data) for e in events(0, 99)))
-            answer = http.post("/devices/blackout").json()
-            assert answer["state"] == "unknown, unsafe"
-            assert "light bank" in answer["detail"]
+            response = http.post("/devices/blackout").json()
+            assert response["state"] == "unknown, unsafe"
+            assert "light bank" in response["detail"]
             kinds = [e.kind for e in events(0, 99) if "unknown" in str(e.data)]
             assert kinds.index("stage.lamps") < kinds.index("stage.blackout"), "told before it ends"
             assert world.show == "OFF"
@@ -150,17 +150,15 @@ def test_while_the_lights_hang_it_says_so_and_darkens_the_projectors(
         assert http.get("/health").json()["status"] == "ok"
 
 
-def test_devices_that_hang_keep_nobody_waiting_who_asked_for_darkness(
-    rig_file, world, tmp_path, monkeypatch
-):
+def test_hanging_devices_delay_no_blackout(rig_file, world, tmp_path, monkeypatch):
     """The answer is "unknown, unsafe"; what it comes to in the end is told, and recorded."""
     with serving(rig_file, tmp_path) as http:
         monkeypatch.setattr(control, "REPLY_S", 0.0)
         with stuck(monkeypatch, ModbusLightBank, "off") as waiting:
             for _ in range(3 * control.MOST_BLACKOUTS):
-                answer = http.post("/devices/blackout").json()
-                assert (answer["safe"], answer["state"]) == (False, "unknown, unsafe")
-                assert "continues" in answer["detail"]
+                response = http.post("/devices/blackout").json()
+                assert (response["safe"], response["state"]) == (False, "unknown, unsafe")
+                assert "continues" in response["detail"]
             assert 0 < waiting() <= control.MOST_BLACKOUTS
             assert http.get("/health").json()["lamps"] == "unknown, unsafe"
         until(lambda: http.get("/health").json()["lamps"] == "dark")
@@ -235,15 +233,15 @@ def test_nobody_waits_for_a_disk_that_does_not_say_whose_a_token_is(rig_file, wo
             assert http.get("/health", headers=hers, timeout=10).status_code == 200
             mine = {"Authorization": "Bearer mine"}
             world.lit = {5}
-            answer = http.post("/devices/blackout", headers=mine, timeout=10).json()
-            assert (answer["state"], world.lit) == ("dark", set())
+            response = http.post("/devices/blackout", headers=mine, timeout=10).json()
+            assert (response["state"], world.lit) == ("dark", set())
         finally:
             Slow.there.set()
         tokens.revoke("ada")
         until(lambda: http.get("/health", headers=hers).status_code == 401)
 
 
-def test_health_is_told_while_the_root_folder_s_disk_hangs(rig_file, tmp_path, monkeypatch):
+def test_health_responds_while_the_root_folder_s_disk_hangs(rig_file, tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "SILENT_S", 0.0)
     slot = WorkerSlot(tmp_path)
     with serving(rig_file, tmp_path) as http:
@@ -255,7 +253,7 @@ def test_health_is_told_while_the_root_folder_s_disk_hangs(rig_file, tmp_path, m
     slot.release()
 
 
-def test_a_blackout_that_fails_over_a_run_that_hangs_is_told(
+def test_a_blackout_that_fails_because_of_a_hanging_run_is_reported(
     rig_file, world, tmp_path, monkeypatch
 ):
     with (
@@ -328,20 +326,22 @@ def test_a_capture_that_is_being_prepared_does_not_begin_after_a_blackout(
 ):
     with serving(rig_file, tmp_path) as http:
         with stuck(monkeypatch, CaptureWriter, "create") as waiting:
-            answers = []
-            ask = threading.Thread(target=lambda: answers.append(http.post("/captures", json=LONG)))
-            ask.start()
+            responses = []
+            start_capture = threading.Thread(
+                target=lambda: responses.append(http.post("/captures", json=LONG))
+            )
+            start_capture.start()
             until(waiting)
             assert_it_can_be_darkened(http, world, None)
-        ask.join()
-        (answer,) = answers
-        assert answer.json()["type"] == "/docs/errors.md#not-now"
+        start_capture.join()
+        (response,) = responses
+        assert response.json()["type"] == "/docs/errors.md#not-now"
         assert world.pulses == 0
         (listed,) = http.get("/captures").json()
         assert (listed["outcome"], listed["frames_written"]) == ("interrupted", 0)
 
 
-def test_a_fault_is_answered_and_the_connection_kept(rig_file, world, tmp_path, monkeypatch):
+def test_a_fault_gets_a_response_and_keeps_the_connection(rig_file, world, tmp_path, monkeypatch):
     # pytest's workers can't hand on a log with half a character
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
     with serving(rig_file, tmp_path) as http:
@@ -352,15 +352,15 @@ def test_a_fault_is_answered_and_the_connection_kept(rig_file, world, tmp_path, 
         monkeypatch.setattr(http.service, "captures", broken)
         port = http.base_url.port
         with socket.create_connection(("127.0.0.1", port)) as line:
-            answers = line.makefile("rb")
+            responses = line.makefile("rb")
             for path, status in (("/captures", b"500"), ("/health", b"200")):
                 line.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-                head, length = answers.readline(), 0
+                head, length = responses.readline(), 0
                 assert status in head, (path, head)
-                while (field := answers.readline()) != b"\r\n":
+                while (field := responses.readline()) != b"\r\n":
                     if field.lower().startswith(b"content-length:"):
                         length = int(field.split(b":")[1])
-                body = json.loads(answers.read(length))
+                body = json.loads(responses.read(length))
                 if status == b"500":
                     assert body["detail"] == r"RuntimeError: caf\udce9"
 
@@ -405,7 +405,7 @@ def test_it_darkens_first_and_starts_whatever_lies_in_its_folder(
         assert http.get("/audit").status_code == 200
 
 
-def test_listeners_hold_no_thread_and_are_all_told(rig_file, tmp_path):
+def test_listeners_hold_no_thread_and_receive_all_events(rig_file, tmp_path):
     with serving(rig_file, tmp_path) as http, ExitStack() as links:
         address = (http.base_url.host, http.base_url.port)
         lines = []
@@ -420,8 +420,8 @@ def test_listeners_hold_no_thread_and_are_all_told(rig_file, tmp_path):
         for number in range(700):  # more than one piece
             http.service.events.publish("test", {"n": number})
         for line in lines:
-            told = (json.loads(x[6:]) for x in line if x.startswith(b"data: "))
-            numbers = (e["data"]["n"] for e in told if e["kind"] == "test")
+            received = (json.loads(x[6:]) for x in line if x.startswith(b"data: "))
+            numbers = (e["data"]["n"] for e in received if e["kind"] == "test")
             assert list(islice(numbers, 700)) == list(range(700))
 
 
@@ -449,9 +449,9 @@ def test_a_start_waits_for_no_capture_on_the_disk(rig_file, world, tmp_path, mon
         try:
             assert_it_can_be_darkened(http, world, None)
             until(lambda: http.get("/health").json()["unread"] == 2)
-            answer = http.get("/captures")
-            assert [c["id"] for c in answer.json()] == names[2:]
-            assert answer.headers["hairstage-unread"] == "2"
+            response = http.get("/captures")
+            assert [c["id"] for c in response.json()] == names[2:]
+            assert response.headers["hairstage-unread"] == "2"
             assert http.get(f"/captures/{names[0]}").json()["outcome"] == "interrupted"
             assert http.get("/health").json()["unread"] == 1
             http.go_on()

@@ -32,7 +32,7 @@ from stage_service.service import Service
 DARK = "POST /devices/blackout"
 NOT_DARK = "The stage was NOT darkened: press the wired emergency stop."
 MINE = {"Authorization": "Bearer mine"}
-Ask = Callable[..., httpx.Response]
+Call = Callable[..., httpx.Response]
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def started(
     args = argparse.Namespace(no_auth=False, root=tmp_path / "root")
 
     @contextmanager
-    def start() -> Iterator[Ask]:
+    def start() -> Iterator[Call]:
         service = Service(rig_file, tmp_path / "root")
         service.take_stage()
         app = create_app(service, processes._access(args, set(), Output(as_json=False)))
@@ -63,37 +63,37 @@ def started(
 
 
 @pytest.fixture
-def ask(started: Callable[..., Any]) -> Iterator[Ask]:
-    with started() as ask:
-        yield ask
+def call(started: Callable[..., Any]) -> Iterator[Call]:
+    with started() as call:
+        yield call
 
 
-def log_in(ask: Ask, token: str = "mine", **more: Any) -> tuple[dict[str, str], dict[str, str]]:
+def log_in(call: Call, token: str = "mine", **more: Any) -> tuple[dict[str, str], dict[str, str]]:
     """The headers with the cookie of a login, and with the blackout right that came with it."""
-    answer = ask("POST /login", json={"token": token}, **more)
-    assert answer.status_code == 200, answer.text
-    cookie = answer.headers["set-cookie"].partition(";")[0]
-    return {"Cookie": cookie}, {"Hairstage-Blackout": answer.json()["blackout"]}
+    response = call("POST /login", json={"token": token}, **more)
+    assert response.status_code == 200, response.text
+    cookie = response.headers["set-cookie"].partition(";")[0]
+    return {"Cookie": cookie}, {"Hairstage-Blackout": response.json()["blackout"]}
 
 
-def is_dark(answer: httpx.Response) -> bool:
-    return bool(answer.json().get("state") == "dark")
+def is_dark(response: httpx.Response) -> bool:
+    return bool(response.json().get("state") == "dark")
 
 
 def test_a_login_and_a_blackout_right_outlast_the_service(started, tokens, tmp_path, world):
     ada = tokens.make("ada", ("read", "steer"))
-    with started() as ask:
-        cookie, right = log_in(ask, ada)
+    with started() as call:
+        cookie, right = log_in(call, ada)
     assert (tmp_path / "root" / "login.key").stat().st_mode & 0o777 == 0o600
-    with started() as ask:
-        assert ask("GET /login", cookie).json()["name"] == "ada"
+    with started() as call:
+        assert call("GET /login", cookie).json()["name"] == "ada"
         for headers in (cookie, right):
             world.lit = {5}
-            assert (is_dark(ask(DARK, headers)), world.lit) == (True, set())
-        asked = [a["who"].partition(" (")[0] for a in ask("GET /audit", MINE).json()]
-        assert asked[-2:] == ["ada", "ada, blackout right"]
+            assert (is_dark(call(DARK, headers)), world.lit) == (True, set())
+        callers = [a["who"].partition(" (")[0] for a in call("GET /audit", MINE).json()]
+        assert callers[-2:] == ["ada", "ada, blackout right"]
         tokens.revoke("ada")
-        refused(ask("GET /login", cookie), "unauthorized", 401)
+        refused(call("GET /login", cookie), "unauthorized", 401)
 
 
 def test_no_number_of_logins_ends_another(rig_file, tokens, tmp_path):
@@ -115,93 +115,93 @@ def test_a_right_opens_the_blackout_and_nothing_else(rig_file, tokens, tmp_path)
     service = Service(rig_file, tmp_path / "root")
     app = create_app(service, Access(tokens))
 
-    def ask(what: str, headers: Any = (), **more: Any) -> httpx.Response:
+    def call(what: str, headers: Any = (), **more: Any) -> httpx.Response:
         return send(app, what, dict(headers), **more)
 
-    _, right = log_in(ask, tokens.make("ada", SCOPES))
+    _, right = log_in(call, tokens.make("ada", SCOPES))
     opened, public = (
         {
             (method, path)
             for method, path in routes_of(app)
-            if ask(f"{method} {path}", headers, json={}).status_code != 401
+            if call(f"{method} {path}", headers, json={}).status_code != 401
         }
         for headers in (right, {})
     )
     assert opened - public == {("POST", "/devices/blackout")}
     assert len(routes_of(app)) > 70
     for other in ("GET /devices/blackout", "PUT /devices/blackout", "POST /devices/blackout/"):
-        refused(ask(other, right), "unauthorized", 401)
-    refused(ask("GET /captures?x=/devices/blackout", right), "unauthorized", 401)
+        refused(call(other, right), "unauthorized", 401)
+    refused(call("GET /captures?x=/devices/blackout", right), "unauthorized", 401)
     service.close()
 
 
-def test_a_right_outlasts_logout_revocation_and_whatever_else_is_sent(ask, tokens, monkeypatch):
-    cookie, right = log_in(ask, tokens.make("ada", ("read",)))
-    assert ask("POST /logout", cookie).json()["blackout"] == right["Hairstage-Blackout"]
+def test_a_right_outlasts_logout_revocation_and_whatever_else_is_sent(call, tokens, monkeypatch):
+    cookie, right = log_in(call, tokens.make("ada", ("read",)))
+    assert call("POST /logout", cookie).json()["blackout"] == right["Hairstage-Blackout"]
     tokens.revoke("ada")
     later = SimpleNamespace(time_ns=lambda: 2 * 10**18)
     monkeypatch.setattr(logins, "time", later)
     for more in ({}, cookie, {"Authorization": "Bearer unknown"}, {"Authorization": "Basic x"}):
-        assert is_dark(ask(DARK, {**more, **right})), more
+        assert is_dark(call(DARK, {**more, **right})), more
 
 
-def test_a_right_is_no_login_and_a_login_no_right(ask, tokens):
-    cookie, right = log_in(ask, tokens.make("ada", SCOPES))
+def test_a_right_is_no_login_and_a_login_no_right(call, tokens):
+    cookie, right = log_in(call, tokens.make("ada", SCOPES))
     name, _, login = cookie["Cookie"].partition("=")
     text = right["Hairstage-Blackout"]
-    refused(ask("GET /login", {"Cookie": f"{name}={text}"}), "unauthorized", 401)
-    refused(ask("GET /login", {"Authorization": f"Bearer {text}"}), "unauthorized", 401)
+    refused(call("GET /login", {"Cookie": f"{name}={text}"}), "unauthorized", 401)
+    refused(call("GET /login", {"Authorization": f"Bearer {text}"}), "unauthorized", 401)
     other = Logins().blackout_right("ada")  # of another root
     payload, _, mac = text.partition(".")
-    refused(ask(DARK, {"Hairstage-Blackout": login}), "unauthorized", 401)
+    refused(call(DARK, {"Hairstage-Blackout": login}), "unauthorized", 401)
     forged = (other, "", ".", "x", "ä", payload, f"{payload}.", f"{payload}.{mac}x")
     for wrong in (*forged, f"{payload[:-1]}.{mac}", f"{payload}x.{mac}", f"{text}.{mac}", mac):
-        refused(ask(DARK, {"Hairstage-Blackout": wrong.encode()}), "unauthorized", 401)
-        refused(ask("GET /login", {"Cookie": f"{name}={wrong}".encode()}), "unauthorized", 401)
+        refused(call(DARK, {"Hairstage-Blackout": wrong.encode()}), "unauthorized", 401)
+        refused(call("GET /login", {"Cookie": f"{name}={wrong}".encode()}), "unauthorized", 401)
 
 
-def test_a_login_is_bound_to_host_and_port(ask):
+def test_a_login_is_bound_to_host_and_port(call):
     here = "http://localhost:8331"
-    cookie, right = log_in(ask, url=here)
-    assert ask("GET /login", cookie, url=here).json()["name"]
+    cookie, right = log_in(call, url=here)
+    assert call("GET /login", cookie, url=here).json()["name"]
     held = cookie["Cookie"].partition("=")[2]
     for host, port in (("localhost", 8332), ("127.0.0.1", 8331)):
         there = {"Cookie": f"hairstage-{port}={held}"}
-        refused(ask("GET /login", there, url=f"http://{host}:{port}"), "unauthorized", 401)
-        assert is_dark(ask(DARK, right, url=f"http://{host}:{port}"))
+        refused(call("GET /login", there, url=f"http://{host}:{port}"), "unauthorized", 401)
+        assert is_dark(call(DARK, right, url=f"http://{host}:{port}"))
 
 
-def test_over_tls_a_cookie_of_the_plain_name_opens_nothing(ask):
+def test_over_tls_a_cookie_of_the_plain_name_opens_nothing(call):
     """Another port of the host could have set it; a browser takes `__Host-` from no other."""
     tls = "https://localhost:8331"
-    cookie, _ = log_in(ask, url=tls)
+    cookie, _ = log_in(call, url=tls)
     assert cookie["Cookie"].startswith("__Host-hairstage-8331=")
-    assert ask("GET /login", cookie, url=tls).json()["name"]
+    assert call("GET /login", cookie, url=tls).json()["name"]
     plain = {"Cookie": cookie["Cookie"].removeprefix("__Host-")}
-    refused(ask("GET /login", plain, url=tls), "unauthorized", 401)
+    refused(call("GET /login", plain, url=tls), "unauthorized", 401)
 
 
-def test_cookies_that_somebody_else_has_set_hide_no_login(ask, tokens):
+def test_cookies_that_somebody_else_has_set_hide_no_login(call, tokens):
     """A page of another port sets one of the name with a longer path: it comes first."""
-    good = log_in(ask)[0]["Cookie"]
-    over = log_in(ask, tokens.make("ada", ("read",)))[0]["Cookie"]
+    good = log_in(call)[0]["Cookie"]
+    over = log_in(call, tokens.make("ada", ("read",)))[0]["Cookie"]
     tokens.revoke("ada")
     name = good.partition("=")[0]
     for first in (f"{name}=x", f"{name}=", over, "; ".join([f"{name}=x"] * 50), f"{over}; {over}"):
-        assert is_dark(ask(DARK, {"Cookie": f"{first}; {good}"})), first
-        assert is_dark(ask(DARK, {"Cookie": f"{good}; {first}"})), first
+        assert is_dark(call(DARK, {"Cookie": f"{first}; {good}"})), first
+        assert is_dark(call(DARK, {"Cookie": f"{good}; {first}"})), first
 
 
 def test_a_logout_outlasts_the_service(started, tokens):
     ada = tokens.make("ada", ("read",))
-    with started() as ask:
-        over, other = log_in(ask, ada)[0], log_in(ask, ada)[0]
-        ask("POST /logout", over)
-    with started() as ask:
-        refused(ask("GET /login", over), "unauthorized", 401)
-        assert ask("GET /login", other).status_code == 200
+    with started() as call:
+        over, other = log_in(call, ada)[0], log_in(call, ada)[0]
+        call("POST /logout", over)
+    with started() as call:
+        refused(call("GET /login", over), "unauthorized", 401)
+        assert call("GET /login", other).status_code == 200
         actions = [
-            (a["who"].partition(" ")[0], a["action"]) for a in ask("GET /audit", MINE).json()
+            (a["who"].partition(" ")[0], a["action"]) for a in call("GET /audit", MINE).json()
         ]
         assert actions == [("ada", "login"), ("ada", "login"), ("ada", "logout")]
 
@@ -222,8 +222,8 @@ def test_many_logouts_keep_the_file_small_and_end_no_login_of_another_token(tmp_
 
 @pytest.mark.parametrize("damage", ["", "x" * 64, "ab" * 31, "ä", None, "pipe", "open"])
 def test_a_damaged_key_opens_nothing_and_is_replaced(started, tmp_path, damage, world):
-    with started() as ask:
-        cookie, right = log_in(ask)
+    with started() as call:
+        cookie, right = log_in(call)
     key = tmp_path / "root" / "login.key"
     old = key.read_text()
     if damage == "open":
@@ -234,32 +234,32 @@ def test_a_damaged_key_opens_nothing_and_is_replaced(started, tmp_path, damage, 
             os.mkfifo(key)
         elif damage is not None:
             key.write_text(damage)
-    with started() as ask:
-        refused(ask("GET /login", cookie), "unauthorized", 401)
+    with started() as call:
+        refused(call("GET /login", cookie), "unauthorized", 401)
         world.lit = {5}
-        assert NOT_DARK in refused(ask(DARK, right), "unauthorized", 401)["detail"]
+        assert NOT_DARK in refused(call(DARK, right), "unauthorized", 401)["detail"]
         assert world.lit == {5}
-        cookie, right = log_in(ask)
+        cookie, right = log_in(call)
         assert (key.stat().st_mode & 0o777, key.read_text() == old) == (0o600, False)
-    with started() as ask:
-        assert ask("GET /login", cookie).status_code == 200
-        assert is_dark(ask(DARK, right))
+    with started() as call:
+        assert call("GET /login", cookie).status_code == 200
+        assert is_dark(call(DARK, right))
 
 
 @pytest.mark.parametrize("damage", ["", "{}", '{"epoch": 1}', None])
-def test_logins_are_over_where_nobody_knows_which_of_them_were_ended(started, tmp_path, damage):
-    with started() as ask:
-        cookie, right = log_in(ask)
+def test_all_logins_end_when_the_list_of_logouts_is_lost(started, tmp_path, damage):
+    with started() as call:
+        cookie, right = log_in(call)
     file = tmp_path / "root" / "logouts.json"
     file.unlink()
     if damage is not None:
         file.write_text(damage)
-    with started() as ask:
-        refused(ask("GET /login", cookie), "unauthorized", 401)
-        assert is_dark(ask(DARK, right))
-        cookie, _ = log_in(ask)
-    with started() as ask:
-        assert ask("GET /login", cookie).status_code == 200
+    with started() as call:
+        refused(call("GET /login", cookie), "unauthorized", 401)
+        assert is_dark(call(DARK, right))
+        cookie, _ = log_in(call)
+    with started() as call:
+        assert call("GET /login", cookie).status_code == 200
 
 
 SMALL = """
@@ -335,66 +335,66 @@ def test_a_disk_that_takes_nothing_locks_nobody_out(tmp_path, disk):
     assert done.stdout.splitlines() == expected[disk], done.stderr
 
 
-def test_a_logout_that_the_disk_did_not_take_says_so(ask, monkeypatch):
+def test_a_logout_that_fails_to_reach_the_disk_reports_it(call, monkeypatch):
     def read_only(*_: Any, **__: Any) -> None:
         raise OSError(30, "Read-only file system")
 
-    cookie, _ = log_in(ask)
+    cookie, _ = log_in(call)
     monkeypatch.setattr(logins, "write_secret", read_only)
     monkeypatch.setattr(Path, "unlink", read_only)
-    answer = ask("POST /logout", cookie)
+    response = call("POST /logout", cookie)
     monkeypatch.undo()
-    assert "revoke the token" in refused(answer, "not-stored", 507)["detail"]
-    assert "Max-Age=0" in answer.headers["set-cookie"]
-    refused(ask("GET /login", cookie), "unauthorized", 401)
+    assert "revoke the token" in refused(response, "not-stored", 507)["detail"]
+    assert "Max-Age=0" in response.headers["set-cookie"]
+    refused(call("GET /login", cookie), "unauthorized", 401)
 
 
 @pytest.mark.parametrize("days", [-1, 1])
-def test_a_clock_that_is_set_ends_logins_and_no_right(ask, monkeypatch, days):
-    cookie, right = log_in(ask)
+def test_a_clock_that_is_set_ends_logins_and_no_right(call, monkeypatch, days):
+    cookie, right = log_in(call)
     real = logins.time.time_ns
     clock = SimpleNamespace(time_ns=lambda: real() + days * 86400 * 10**9)
     monkeypatch.setattr(logins, "time", clock)
-    refused(ask("GET /login", cookie), "unauthorized", 401)
-    assert is_dark(ask(DARK, right))
-    assert ask("GET /login", log_in(ask)[0]).status_code == 200
+    refused(call("GET /login", cookie), "unauthorized", 401)
+    assert is_dark(call(DARK, right))
+    assert call("GET /login", log_in(call)[0]).status_code == 200
 
 
-def test_a_command_ends_all_blackout_rights_at_once(ask, tmp_path, capsys):
-    cookie, right = log_in(ask)
-    assert is_dark(ask(DARK, right))
+def test_a_command_ends_all_blackout_rights_at_once(call, tmp_path, capsys):
+    cookie, right = log_in(call)
+    assert is_dark(call(DARK, right))
     assert main(["token", "revoke-blackouts", "--root", str(tmp_path / "root")]) == 0
     assert "logins have ended" in capsys.readouterr().out
-    until(lambda: ask(DARK, right).status_code == 401)
-    refused(ask("GET /login", cookie), "unauthorized", 401)
-    assert is_dark(ask(DARK, log_in(ask)[1]))
-    assert is_dark(ask(DARK, MINE))
-    assert "blackout.revoke" in [a["action"] for a in ask("GET /audit", MINE).json()]
+    until(lambda: call(DARK, right).status_code == 401)
+    refused(call("GET /login", cookie), "unauthorized", 401)
+    assert is_dark(call(DARK, log_in(call)[1]))
+    assert is_dark(call(DARK, MINE))
+    assert "blackout.revoke" in [a["action"] for a in call("GET /audit", MINE).json()]
     assert main(["token", "revoke-blackouts", "--root", str(tmp_path / "none")]) == 3
 
 
-def test_a_key_that_goes_missing_while_the_service_runs_ends_nothing(ask, tmp_path):
-    cookie, right = log_in(ask)
+def test_a_key_that_goes_missing_while_the_service_runs_ends_nothing(call, tmp_path):
+    cookie, right = log_in(call)
     (tmp_path / "root" / "login.key").unlink()
     for _ in range(3):
-        assert ask("GET /login", cookie).status_code == 200
-        assert is_dark(ask(DARK, right))
+        assert call("GET /login", cookie).status_code == 200
+        assert is_dark(call(DARK, right))
 
 
-def test_a_blackout_that_is_refused_says_that_it_was_not_dark(ask, world):
-    _, right = log_in(ask)
+def test_a_blackout_that_is_refused_says_that_it_was_not_dark(call, world):
+    _, right = log_in(call)
     world.lit = {5}
     for headers in ({}, {"Authorization": "Bearer x"}, {"Hairstage-Blackout": "x.y"}):
-        detail = refused(ask(DARK, headers), "unauthorized", 401)["detail"]
+        detail = refused(call(DARK, headers), "unauthorized", 401)["detail"]
         assert detail == f"Log in again. {NOT_DARK}"
     for headers in (right, MINE):
         foreign = {**headers, "Origin": "http://evil.example"}
-        assert NOT_DARK in refused(ask(DARK, foreign), "foreign-origin", 403)["detail"]
+        assert NOT_DARK in refused(call(DARK, foreign), "foreign-origin", 403)["detail"]
         foreign = {**headers, "Host": "evil.example"}
-        assert NOT_DARK in refused(ask(DARK, foreign), "http", 421)["detail"]
+        assert NOT_DARK in refused(call(DARK, foreign), "http", 421)["detail"]
     assert world.lit == {5}
     for body in (b"[", b'{"x": NaN}', b"x" * 2_000_000):  # a blackout has none, and reads none
-        assert is_dark(ask(DARK, {**right, "Content-Type": "application/json"}, content=body))
+        assert is_dark(call(DARK, {**right, "Content-Type": "application/json"}, content=body))
     assert world.lit == set()
 
 

@@ -40,7 +40,7 @@ class Callers:
     def __init__(self, http: Client, tokens: dict[str, str], stack: ExitStack) -> None:
         self.http, self._tokens, self._stack = http, tokens, stack
 
-    def ask(self, name: str, what: str, **more: Any) -> httpx.Response:
+    def send(self, name: str, what: str, **more: Any) -> httpx.Response:
         """The answer to a request like "GET /rig" by the token of that name ("": by none)."""
         method, path = what.split(" ")
         own = {"Authorization": f"Bearer {self._tokens[name]}"} if name else {}
@@ -79,11 +79,11 @@ def ended(link: socket.socket) -> bool:
     return True
 
 
-def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
+def assert_refused(response: httpx.Response, status: int, *words: str) -> None:
     """The problem names the limit, and when to try again."""
-    problem = answer.json()
-    assert (answer.status_code, problem["type"]) == (status, "/docs/errors.md#no-place"), problem
-    assert int(answer.headers["retry-after"]) > 0
+    problem = response.json()
+    assert (response.status_code, problem["type"]) == (status, "/docs/errors.md#no-place"), problem
+    assert int(response.headers["retry-after"]) > 0
     assert all(word in problem["detail"] for word in words), problem["detail"]
 
 
@@ -109,18 +109,18 @@ def limit(monkeypatch) -> Callable[..., None]:
 def shooting(callers: Callers, world: Any) -> Iterator[str]:
     """The id of a capture that is being shot until the end of the block."""
     with world.held():
-        capture: str = callers.ask("ada", "POST /captures", json=LONG).json()["id"]
+        capture: str = callers.send("ada", "POST /captures", json=LONG).json()["id"]
         until(lambda: callers.http.service.running == capture)
         yield capture
-        callers.ask("ada", f"POST /captures/{capture}/abort")
+        callers.send("ada", f"POST /captures/{capture}/abort")
     until(lambda: callers.http.service.running is None)
 
 
 def assert_darkened(callers: Callers, world: Any, name: str) -> None:
     """A blackout by that token is answered, and the lamps are off."""
     world.lit, world.show = {5}, "ON 65535"
-    answer = callers.ask(name, "POST /devices/blackout")
-    assert (answer.status_code, answer.json()["state"]) == (200, "dark")
+    response = callers.send(name, "POST /devices/blackout")
+    assert (response.status_code, response.json()["state"]) == (200, "dark")
     assert (world.lit, world.show) == (set(), "OFF")
 
 
@@ -208,7 +208,7 @@ def test_streams_of_a_token_leave_the_console_its_own(callers):
     each = LIMITS["streams"].each
     held = [callers.open("reader", "GET /events") for _ in range(each)]
     assert {status(link) for link in held} == {200}
-    refused = callers.ask("reader", "GET /events")
+    refused = callers.send("reader", "GET /events")
     assert_refused(refused, 429, "token 'reader'", f"has {each} of", "event streams: close one")
     own = callers.open("ada", "GET /events")
     assert status(own) == 200
@@ -219,7 +219,7 @@ def test_streams_of_a_token_leave_the_console_its_own(callers):
     until(lambda: status(callers.open("reader", "GET /events")) == 200, pause=0.05)
 
 
-def test_answers_that_nobody_takes_are_ended(callers, world, monkeypatch):
+def test_responses_that_no_client_reads_are_aborted(callers, world, monkeypatch):
     """515 archives that nobody reads took every place until they were closed (F5)."""
     monkeypatch.setattr(connections, "STALL_S", 0.1)
     folder = callers.http.service.root / "models" / "large"
@@ -228,28 +228,28 @@ def test_answers_that_nobody_takes_are_ended(callers, world, monkeypatch):
     tar = "GET /models/large/archive.tar"
     held = [callers.open("reader", tar, received=2048) for _ in range(LIMITS["downloads"].each)]
     assert {status(link) for link in held} == {200}
-    refused = callers.ask("reader", tar)
+    refused = callers.send("reader", tar)
     assert_refused(refused, 429, "token 'reader' has 4 of", "read them to their end")
-    assert len(callers.ask("ada", tar).content) > 8 << 20
+    assert len(callers.send("ada", tar).content) > 8 << 20
     assert_darkened(callers, world, "ada")
     assert_darkened(callers, world, "reader")
     assert all(ended(link) for link in held)
-    until(lambda: callers.ask("reader", "HEAD /models/large/archive.tar").is_success)
+    until(lambda: callers.send("reader", "HEAD /models/large/archive.tar").is_success)
 
 
 def test_a_slow_upload_keeps_nobody_else_waiting(callers, limit, monkeypatch):
     """Four of them kept everybody's for 240 s (F9); and they are ended."""
     limit("uploads", wait_s=0.1)
     put, more = "PUT /uploads/a/head.obj", "Content-Length: 1000000\r\n"
-    assert callers.ask("reader", put, content=HEAD).status_code == 403
+    assert callers.send("reader", put, content=HEAD).status_code == 403
     for _ in range(4):
         assert status(callers.open("reader", put, more)) == 403
     slow = [callers.open("bob", put, more) for _ in range(LIMITS["uploads"].steering)]
-    asked = callers.http.service
+    own_service = callers.http.service
     until(lambda: places_of(callers).held("uploads", Owner("bob", steers=True)) == 2)
-    assert_refused(callers.ask("bob", put, content=HEAD), 429, "token 'bob' has 2 of")
-    assert callers.ask("ada", put, content=HEAD).status_code == 200
-    assert asked.storage.uploads()
+    assert_refused(callers.send("bob", put, content=HEAD), 429, "token 'bob' has 2 of")
+    assert callers.send("ada", put, content=HEAD).status_code == 200
+    assert own_service.storage.uploads()
     monkeypatch.setattr(bodies, "GRACE_S", 0.1)
     late = callers.open("ada", put, more)
     late.sendall(HEAD)
@@ -269,14 +269,14 @@ def test_without_places_a_token_may_still_darken(callers, world, limit, monkeypa
     limit("connections", each=2)
     held = [callers.open("reader", "GET /events") for _ in range(2)]
     assert {status(link) for link in held} == {200}
-    refused = callers.ask("reader", "GET /rig")
+    refused = callers.send("reader", "GET /rig")
     assert_refused(refused, 429, "token 'reader' has 2 of at most 2 connections")
     assert refused.headers["content-security-policy"].startswith("sandbox")
     assert_darkened(callers, world, "reader")
     for path in ("/", "/health", "/login"):
-        answer = callers.ask("reader", f"GET {path}")
-        assert (answer.status_code, answer.headers["connection"]) == (200, "close"), path
-    assert callers.ask("ada", "GET /rig").status_code == 200
+        response = callers.send("reader", f"GET {path}")
+        assert (response.status_code, response.headers["connection"]) == (200, "close"), path
+    assert callers.send("ada", "GET /rig").status_code == 200
 
 
 def test_silent_connections_keep_nobody_out(callers, world, monkeypatch):
@@ -296,18 +296,18 @@ def test_while_a_capture_is_shot_others_wait_and_who_steers_does_not(callers, wo
     monkeypatch.setattr(throttle, "WAIT_S", 0.2)
     monkeypatch.setattr(throttle, "SHARE", 1e-6)  # after the first, none has a turn
     with shooting(callers, world) as capture:
-        assert callers.ask("reader", "GET /rig").status_code in (200, 503)
+        assert callers.send("reader", "GET /rig").status_code in (200, 503)
         for name, what in (
             ("reader", "GET /audit"),
             ("jobber", "GET /captures"),
             ("reader", "POST /captures/another/abort"),
             ("", "GET /rig"),
         ):
-            assert_refused(callers.ask(name, what), 503, "a capture is running")
+            assert_refused(callers.send(name, what), 503, "a capture is running")
         for what in ("GET /rig", "GET /captures", f"GET /captures/{capture}/steps"):
-            assert callers.ask("ada", what).status_code == 200
-        assert callers.ask("reader", f"POST /captures/{capture}/abort").status_code == 200
-    assert callers.ask("reader", "GET /rig").status_code == 200
+            assert callers.send("ada", what).status_code == 200
+        assert callers.send("reader", f"POST /captures/{capture}/abort").status_code == 200
+    assert callers.send("reader", "GET /rig").status_code == 200
     assert_darkened(callers, world, "reader")
 
 
@@ -315,20 +315,20 @@ def test_while_a_capture_is_shot_models_are_shown_to_who_steers_alone(callers, w
     """Eight viewers slowed it by half (F16)."""
     folder = callers.http.service.root / "models" / "m"
     Model(folder).create().write_strands(Strands.from_list([[[0, 0, 0], [0, 0, 1]]], radius=1e-4))
-    assert callers.ask("reader", "GET /view/models/m").json()["name"] == "m"
+    assert callers.send("reader", "GET /view/models/m").json()["name"] == "m"
     with shooting(callers, world):
         for what in ("GET /view/models/m", "POST /view/models/m/indirect/view"):
-            assert_refused(callers.ask("reader", what), 503, "a capture is running")
-        assert callers.ask("ada", "GET /view/models/m").json()["name"] == "m"
+            assert_refused(callers.send("reader", what), 503, "a capture is running")
+        assert callers.send("ada", "GET /view/models/m").json()["name"] == "m"
 
 
-def test_what_others_send_is_small_and_what_is_wrong_with_it_is_told_in_few_words(callers):
+def test_large_bodies_are_refused_and_errors_are_short(callers):
     large = json.dumps({"lights": ["light_001"] * 20_000}).encode()
-    assert callers.ask("reader", "POST /plans:validate", content=large).status_code == 413
+    assert callers.send("reader", "POST /plans:validate", content=large).status_code == 413
     wrong = json.dumps({"lights": [[]] * 4000}).encode()
-    told = callers.ask("ada", "POST /plans:validate", content=wrong).json()
-    assert len(told["errors"]) <= 20
-    assert len(told["detail"]) < 4000
+    reported = callers.send("ada", "POST /plans:validate", content=wrong).json()
+    assert len(reported["errors"]) <= 20
+    assert len(reported["detail"]) < 4000
 
 
 def test_a_token_s_own_connections_that_wait_make_room_for_its_next(callers, limit):

@@ -31,9 +31,9 @@ def plan(light: int) -> dict[str, Any]:
 
 
 def add(http: Client, body: dict[str, Any]) -> str:
-    answer = http.post("/queue", json=body)
-    assert answer.status_code == 201, answer.text
-    entry: str = answer.json()["id"]
+    response = http.post("/queue", json=body)
+    assert response.status_code == 201, response.text
+    entry: str = response.json()["id"]
     return entry
 
 
@@ -50,7 +50,7 @@ def ended(http: Client, number: int) -> list[dict[str, Any]]:
     return found
 
 
-def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
+def test_queued_captures_start_in_their_order(http):
     http.go_on()
     running = http.post("/captures", json={"plan": LONG}).json()["id"]
     a, b, c = (add(http, plan(i)) for i in range(3))
@@ -80,7 +80,7 @@ def test_what_waits_begins_by_itself_in_the_order_that_it_was_put_in(http):
 
 
 @pytest.mark.parametrize("how", ["abort", "blackout", "failure"])
-def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(http, world, how):
+def test_after_abort_blackout_or_failure_the_queue_waits_for_a_person(http, world, how):
     http.go_on()
     running = http.post("/captures", json={"plan": LONG}).json()["id"]
     entry = add(http, plan(1))
@@ -103,7 +103,7 @@ def test_after_an_abort_a_blackout_or_a_failure_a_person_says_when_it_goes_on(ht
     assert ended(http, 2)[1]["request"] == {"queue": entry}
 
 
-def test_who_aborts_what_is_not_there_or_over_is_told_the_truth(http):
+def test_abort_of_a_missing_or_finished_capture_is_refused_with_the_reason(http):
     done = http.post("/captures", json=plan(3)).json()["id"]
     http.service._captures.wait(done, 30)
     http.go_on()
@@ -137,7 +137,7 @@ def test_nothing_begins_while_the_stage_is_latched_or_somebody_steers(http, worl
     assert ended(http, 1)[0]["outcome"] == "completed"
 
 
-def test_a_plan_that_flashes_is_started_by_somebody_who_answers_for_it(rig_file, world, tmp_path):
+def test_a_flashing_plan_needs_a_responsible_person_to_start(rig_file, world, tmp_path):
     living = replace(rig_file, safety=SafetyLimits(living_subject=True))
     with serving(living, tmp_path / "root") as http:
         http.go_on()
@@ -157,7 +157,7 @@ def test_a_plan_that_flashes_is_started_by_somebody_who_answers_for_it(rig_file,
         assert [e["id"] for e in http.get("/queue").json()["waiting"]] == [behind]
 
 
-def test_a_restart_keeps_what_waits_and_shoots_nothing_twice(rig_file, tmp_path):
+def test_a_restart_keeps_the_queue_and_captures_nothing_twice(rig_file, tmp_path):
     root = tmp_path / "root"
     with serving(rig_file, root) as http:
         http.post("/queue:hold")
@@ -244,7 +244,7 @@ def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, t
     assert world.pulses == 0
 
 
-def test_what_another_version_put_in_is_told_in_a_sentence(rig_file, tmp_path):
+def test_an_entry_of_another_version_is_reported_in_a_sentence(rig_file, tmp_path):
     """Every second row: plans of earlier versions could have that."""
     old = {"id": "q-1", "by": "Ada", "added": "", "request": {"plan": {"rows": {"step": 2}}}}
     (tmp_path / "queue.json").write_text(json.dumps({"held": [], "waiting": [old]}))

@@ -68,8 +68,8 @@ def lines(service: Service) -> list[Action]:
 
 def wrong(app: FastAPI, count: int = 1, **more: Any) -> httpx.Response:
     for _ in range(count):
-        answer = send(app, "POST /login", {}, json={"token": "guessed"}, **more)
-    return answer
+        response = send(app, "POST /login", {}, json={"token": "guessed"}, **more)
+    return response
 
 
 def test_refusals_on_what_steers_leave_a_line_and_those_on_what_shows_none(app, service, tokens):
@@ -165,9 +165,9 @@ def test_wrong_logins_make_their_address_wait_and_no_other(app, service, tokens,
     right = {"token": tokens.make("ada", ("read",))}
     first = send(app, "POST /login", {}, json=right)
     assert wrong(app, 5).status_code == 401
-    answer = send(app, "POST /login", {}, json=right)
-    refused(answer, "too-many-logins", 429)
-    assert 1 <= int(answer.headers["retry-after"]) <= 2
+    response = send(app, "POST /login", {}, json=right)
+    refused(response, "too-many-logins", 429)
+    assert 1 <= int(response.headers["retry-after"]) <= 2
     assert send(app, "POST /login", {}, json=right, host="10.0.0.2").status_code == 200
     assert send(app, DARK, {}).status_code == 401
     for headers in (MINE, {"Hairstage-Blackout": first.json()["blackout"]}):
@@ -226,8 +226,8 @@ def test_a_disk_that_takes_no_line_keeps_nobody_from_a_blackout(
             assert http.post("/captures", json={}, timeout=10).status_code == 401
         for _ in range(3):
             world.lit = {5}
-            answer = http.post("/devices/blackout", headers=MINE).json()
-            assert (answer["state"], world.lit) == ("dark", set())
+            response = http.post("/devices/blackout", headers=MINE).json()
+            assert (response["state"], world.lit) == ("dark", set())
         for _ in range(70):  # more than there are threads for what must be answered
             assert http.post("/captures/x/abort", headers=MINE).status_code == 404
         assert http.post("/devices/blackout", headers=MINE).json()["state"] == "dark"
@@ -251,8 +251,8 @@ def test_a_client_does_not_write_its_own_address(rig_file, tokens, tmp_path):
     """It could else have another address wait, and its own never."""
     with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
         headers = {"X-Forwarded-For": "10.9.9.9", "X-Forwarded-Proto": "https"}
-        answer = http.post("/login", json={"token": "mine"}, headers=headers)
-        assert "Secure" not in answer.headers["set-cookie"]
+        response = http.post("/login", json={"token": "mine"}, headers=headers)
+        assert "Secure" not in response.headers["set-cookie"]
         who = http.get("/audit", headers=MINE).json()[-1]["who"]
         assert "127.0.0.1" in who
 

@@ -66,7 +66,7 @@ def test_every_route_has_a_decided_scope_and_no_other_has(app):
 def test_a_token_of_one_scope_opens_what_that_scope_opens(app, tmp_path):
     tokens = Tokens(tmp_path / "tokens.json")
     made = {scope: tokens.make(scope, (scope,)) for scope in SCOPES}
-    asked = 0
+    requested = 0
     for method, path in routes_of(app):
         public = path in OPEN or path.startswith(("/web/", "/view/page/"))
         if public or (method, path) in (("POST", "/login"), ("GET", "/events")):
@@ -75,13 +75,13 @@ def test_a_token_of_one_scope_opens_what_that_scope_opens(app, tmp_path):
         for scope, token in made.items():
             url = f"{method} {path}" + ("?force=true" if "lease" in path else "")
             mine = {"Authorization": f"Bearer {token}"}
-            answer = send(app, url, mine, json=[])
-            asked += 1
+            response = send(app, url, mine, json=[])
+            requested += 1
             if needed is None or scope in needed:
-                assert answer.status_code not in (401, 403) or "lease" in path, (url, scope)
+                assert response.status_code not in (401, 403) or "lease" in path, (url, scope)
             else:
-                assert refused(answer, "forbidden", 403)["scope"] in needed, (url, scope)
-    assert asked > 300
+                assert refused(response, "forbidden", 403)["scope"] in needed, (url, scope)
+    assert requested > 300
 
 
 def test_the_description_of_the_api_names_the_same_scopes(app):
@@ -105,6 +105,6 @@ def test_a_request_without_the_scope_is_refused_before_its_body_is_read(app, tmp
 
     # `Expect`: else what still comes of a refused request is taken and forgotten.
     headers = {"Authorization": f"Bearer {token}", "Expect": "100-continue"}
-    answer = send(app, "PUT /uploads/x/head.obj", headers, content=body())
-    assert refused(answer, "forbidden", 403)["scope"] == "steer"
+    response = send(app, "PUT /uploads/x/head.obj", headers, content=body())
+    assert refused(response, "forbidden", 403)["scope"] == "steer"
     assert taken == []

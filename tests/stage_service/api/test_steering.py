@@ -78,41 +78,41 @@ def test_the_command_line_steers_under_a_lease(http, tmp_path, capsys):
     plan = tmp_path / "plan.json"
     plan.write_text(json.dumps(SHORT))
     start = ("capture", "start", "--plan", str(plan), "--wait")
-    code, told = run(*start)
-    assert (code, told["capture"]["outcome"]) == (0, "completed")
+    code, output = run(*start)
+    assert (code, output["capture"]["outcome"]) == (0, "completed")
     assert run("lease", "show")[1]["holder"] is None, "released at the end"
     assert audit(http)[0][1] == "lease.take"
     assert audit(http)[-1][1:] == ("lease.release", "ok")
 
     token = run("lease", "take", "--holder", "Ada")[1]["token"]
-    code, told = run(*start)
-    assert (code, told["error"]["problem"]["holder"]) == (1, "Ada")
+    code, output = run(*start)
+    assert (code, output["error"]["problem"]["holder"]) == (1, "Ada")
     assert run(*start, "--lease", token)[0] == 0
     assert run("lease", "renew", "--lease", token)[1]["holder"] == "Ada"
     assert run("lease", "release", "--lease", token)[1]["holder"] is None
-    code, told = run("capture", "resume", told_id(http), "--armed-by", "Ada")
-    assert (code, told["error"]["problem"]["type"]) == (1, "/docs/errors.md#wrong-state")
+    code, output = run("capture", "resume", reported_id(http), "--armed-by", "Ada")
+    assert (code, output["error"]["problem"]["type"]) == (1, "/docs/errors.md#wrong-state")
 
 
 def test_the_command_line_darkens_and_says_what_it_knows(http, world, capsys):
     def run(*words: str) -> tuple[int, str]:
         code = main(["stage", *words, "--url", str(http.base_url)])
-        told = capsys.readouterr()
-        return code, told.out + told.err
+        output = capsys.readouterr()
+        return code, output.out + output.err
 
     assert run("status") == (0, "ok: lamps dark, no capture runs, no worker runs\n")
     world.lit = {2}
-    code, told = run("blackout")
-    assert (code, world.lit, told.partition(":")[0]) == (0, set(), "dark")
-    code, told = run("acknowledge", "Ada", "all dark, I looked")
-    assert (code, "nothing to acknowledge" in told) == (1, True), told
+    code, output = run("blackout")
+    assert (code, world.lit, output.partition(":")[0]) == (0, set(), "dark")
+    code, output = run("acknowledge", "Ada", "all dark, I looked")
+    assert (code, "nothing to acknowledge" in output) == (1, True), output
     world.lit, world.stuck_lamps = {7}, True
-    code, told = run("blackout")
-    assert (code, told.partition(":")[0]) == (1, "unknown, unsafe")
+    code, output = run("blackout")
+    assert (code, output.partition(":")[0]) == (1, "unknown, unsafe")
     assert run("status")[1].startswith("unsafe: lamps unknown, unsafe, no capture runs")
 
 
-def told_id(http: Client) -> str:
+def reported_id(http: Client) -> str:
     capture: str = http.get("/captures").json()[0]["id"]
     return capture
 
@@ -162,9 +162,7 @@ def test_a_stage_that_is_not_dark_is_latched_and_stays_so_over_a_restart(rig_fil
         assert latch == ["latch.set", "latch.cleared"]
 
 
-def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
-    unread_rig, world, tmp_path, capsys
-):
+def test_a_person_clears_the_latch_of_a_link_without_read_back(unread_rig, world, tmp_path, capsys):
     with serving(unread_rig, tmp_path / "root") as http:
         world.deaf_lights = True
         assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"
@@ -177,10 +175,10 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
         dark = {"state": "said to be dark", "detail": looked, "latched": None, "accepted": False}
         assert http.post("/devices/acknowledge", json=word).json() == dark
         assert http.get("/devices").json()["safety"] == dark
-        told = {e.kind: e.data for e in http.service.events.after(before, 99)}
-        assert told["stage.lamps"] == dark
+        output = {e.kind: e.data for e in http.service.events.after(before, 99)}
+        assert output["stage.lamps"] == dark
         unlatched = {"latched": False, "safe": False, "state": dark["state"], "detail": looked}
-        assert told["stage.latch"] == unlatched
+        assert output["stage.latch"] == unlatched
         recorded = [(a["action"], a["detail"]) for a in http.get("/audit").json()[-2:]]
         assert recorded == [("latch.cleared", looked), ("acknowledge", "Ada: all dark, I looked")]
         main(["stage", "status", "--url", str(http.base_url)])
@@ -200,9 +198,7 @@ def test_a_person_who_has_looked_ends_the_latch_where_the_link_cannot_tell(
         refused(http.post("/devices/acknowledge", json=word), "cannot-acknowledge")
 
 
-def test_a_person_ends_what_a_damaged_latch_began_where_the_link_cannot_tell(
-    unread_rig, world, tmp_path
-):
+def test_a_person_clears_a_damaged_latch_of_a_link_without_read_back(unread_rig, world, tmp_path):
     root = tmp_path / "root"
     root.mkdir()
     (root / "unsafe.json").write_text("{")
@@ -358,9 +354,9 @@ def test_a_capture_of_a_plan_of_another_version_is_not_continued(http):
     """Every second row: plans of earlier versions could have that."""
     capture = interrupted(http)
     file = Path(done(http, capture)["path"]) / "plan.json"
-    told = json.loads(file.read_text())
-    told["plan"]["rows"]["step"] = 2
-    file.write_text(json.dumps(told))
+    output = json.loads(file.read_text())
+    output["plan"]["rows"]["step"] = 2
+    file.write_text(json.dumps(output))
     problem = refused(http.post(f"/captures/{capture}/resume"), "invalid-plan")
     assert "plan is not of this version: rows.step: Input should be 1" in problem["detail"]
     assert done(http, capture)["outcome"] == "aborted"

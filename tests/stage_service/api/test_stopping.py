@@ -16,7 +16,9 @@ from stage_service.api.connections import limits, listening
 from stage_service.service import Service
 
 
-def test_blackout_and_health_are_answered_while_it_stops(rig_file, world, tmp_path, monkeypatch):
+def test_blackout_and_health_respond_while_the_service_stops(
+    rig_file, world, tmp_path, monkeypatch
+):
     service, closing, go = (
         Service(rig_file, tmp_path / "root"),
         threading.Event(),
@@ -49,8 +51,8 @@ def test_blackout_and_health_are_answered_while_it_stops(rig_file, world, tmp_pa
                 server.handle_exit(signal.SIGTERM, None)
                 closing.wait()
                 health = http.get("/health").json()
-                told = "the service is stopping and lights nothing"
-                assert (health["status"], health["problems"]) == ("degraded", [told])
+                message = "the service is stopping and lights nothing"
+                assert (health["status"], health["problems"]) == ("degraded", [message])
                 assert http.post("/captures", json={}).status_code == 409
                 world.lit = {3}
                 assert http.post("/devices/blackout").json()["state"] == "dark"

@@ -73,10 +73,10 @@ def test_files_have_tags_and_ranges_and_head_is_get_without_its_body(http):
     part = http.get(frame, headers={"Range": "bytes=10-19"})
     assert (part.status_code, part.content) == (206, whole.content[10:20])
     for path in (frame, "/health", f"/captures/{capture['id']}/archive.tar", "/nowhere"):
-        got, asked = http.get(path), http.head(path)
-        assert (asked.status_code, asked.content) == (got.status_code, b"")
+        got, requested = http.get(path), http.head(path)
+        assert (requested.status_code, requested.content) == (got.status_code, b"")
         for name in ("content-length", "content-type", "etag"):
-            assert asked.headers.get(name) == got.headers.get(name)
+            assert requested.headers.get(name) == got.headers.get(name)
     begin = time.monotonic()
     assert http.head("/events", timeout=10).status_code == 200
     assert time.monotonic() - begin < 10, "an endless stream would run into the time-out"
@@ -95,15 +95,15 @@ def test_what_is_removed_is_in_the_trash_and_comes_back(http):
     assert slug(http.get(f"/captures/{name}")) == "unknown-capture"
     assert slug(http.delete(f"/captures/{name}")) == "unknown-capture"
     assert http.get("/trash").json() == [removed]
-    told = http.service.events.after(0, 10_000)
-    assert [e.data for e in told if e.kind == "capture.removed"] == [{"id": name}]
+    reported = http.service.events.after(0, 10_000)
+    assert [e.data for e in reported if e.kind == "capture.removed"] == [{"id": name}]
     assert http.delete("/trash").json() == [], "it is kept for 30 days"
     assert http.post(f"/trash/{removed['name']}/restore").json()["id"] == name
     assert {p.name: p.stat().st_size for p in path.rglob("*") if p.is_file()} == before
     assert verify(path) == []
     assert [c["outcome"] for c in http.get("/captures").json()] == ["completed"]
-    told = http.service.events.after(0, 10_000)
-    assert [e.data for e in told if e.kind == "capture.restored"] == [{"id": name}]
+    reported = http.service.events.after(0, 10_000)
+    assert [e.data for e in reported if e.kind == "capture.restored"] == [{"id": name}]
     http.delete(f"/captures/{name}")
     gone = http.delete("/trash", params={"older_than_days": 0, "dry_run": True}).json()
     assert http.delete("/trash", params={"older_than_days": 0}).json() == gone
@@ -121,16 +121,16 @@ def _files(path: Path) -> list[Path]:
 def test_what_is_in_use_stays(http, world):
     world.busy = {"cam_1": 10**9}
     running = http.post("/captures", json={"plan": SHORT}).json()["id"]
-    for ask in (http.delete, http.get):
-        path = f"/captures/{running}" + ("/archive.tar" if ask == http.get else "")
-        assert ask(path).status_code == 409
+    for method in (http.delete, http.get):
+        path = f"/captures/{running}" + ("/archive.tar" if method == http.get else "")
+        assert method(path).status_code == 409
     assert slug(http.delete(f"/captures/{running}")) == "wrong-state"
     http.post("/devices/blackout")
     until(lambda: http.get(f"/captures/{running}").json()["state"] == "done")
     world.busy = {}
     capture = shot(http)
-    asked = {"capture": capture["id"], "pipeline": {"name": "reconstruct"}, "model": "mine"}
-    job = http.post("/jobs", json=asked).json()["id"]
+    requested = {"capture": capture["id"], "pipeline": {"name": "reconstruct"}, "model": "mine"}
+    job = http.post("/jobs", json=requested).json()["id"]
     Model(http.service.root / "models" / "mine").create().write_json("results.json", {"a": 1})
     assert job in http.delete(f"/captures/{capture['id']}").json()["detail"]
     assert slug(http.delete("/models/mine")) == "in-use"
@@ -151,9 +151,9 @@ def test_what_is_in_use_stays(http, world):
 
 
 def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatch):
-    asked = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}}
+    requested = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}}
     key = {"Idempotency-Key": "once"}
-    job = http.post("/jobs", json=asked, headers=key).json()["id"]
+    job = http.post("/jobs", json=requested, headers=key).json()["id"]
     get, not_yet = http.service._queue.get, iter([NoSuchJob("not yet")])
 
     def looked(name: str) -> Any:
@@ -162,7 +162,7 @@ def test_a_job_that_was_just_enqueued_under_the_key_is_that_one(http, monkeypatc
         return get(name)
 
     monkeypatch.setattr(http.service._queue, "get", looked)
-    again = http.post("/jobs", json=asked, headers=key)
+    again = http.post("/jobs", json=requested, headers=key)
     assert (again.status_code, again.json().get("id")) == (202, job)
 
 
@@ -172,13 +172,13 @@ def test_a_key_belongs_to_one_caller_and_one_request(rig_file, world, tmp_path):
     eve = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'jobs'))}"}
     with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
         http.headers["Authorization"] = "Bearer own"
-        asked = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}, "model": "a"}
+        requested = {"capture": shot(http)["id"], "pipeline": {"name": "reconstruct"}, "model": "a"}
         key = {"Idempotency-Key": "once"}
-        first = http.post("/jobs", json=asked, headers=key).json()["id"]
-        other = http.post("/jobs", json={**asked, "model": "b"}, headers=key)
+        first = http.post("/jobs", json=requested, headers=key).json()["id"]
+        other = http.post("/jobs", json={**requested, "model": "b"}, headers=key)
         assert (other.status_code, slug(other)) == (409, "key-used")
         assert first in other.json()["detail"]
-        hers = http.post("/jobs", json={**asked, "model": "c"}, headers={**eve, **key})
+        hers = http.post("/jobs", json={**requested, "model": "c"}, headers={**eve, **key})
         assert hers.status_code == 202
         assert hers.json()["id"] != first
 
@@ -193,13 +193,13 @@ def test_who_may_remove(rig_file, world, tmp_path):
             stopped = http.post("/captures", json={"plan": {"projectors": []}}).json()["id"]
             http.post(f"/captures/{stopped}/abort")
         until(lambda: http.get(f"/captures/{stopped}").json()["state"] == "done")
-        for ask in (
+        for method in (
             lambda: http.delete(f"/captures/{whole}", headers=steers),
             lambda: http.delete("/trash", headers=steers),
             lambda: http.delete("/models/any", headers=steers),
             lambda: http.post("/trash/any/restore", headers=steers),
         ):
-            assert slug(ask()) == "forbidden"
+            assert slug(method()) == "forbidden"
         assert http.delete(f"/captures/{stopped}", headers=steers).status_code == 200
         assert http.delete(f"/captures/{whole}").status_code == 200
 
@@ -229,9 +229,9 @@ def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monke
 def test_a_snapshot_is_nothing_to_keep(http):
     http.post("/snapshot", json={})
     until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
-    answer = http.delete("/captures/snapshot")
-    assert slug(answer) == "bad-input"
-    assert "kept until the next one only" in answer.json()["detail"]
+    response = http.delete("/captures/snapshot")
+    assert slug(response) == "bad-input"
+    assert "kept until the next one only" in response.json()["detail"]
     assert http.get("/trash").json() == []
 
 
@@ -283,10 +283,10 @@ def test_head_and_masks_are_uploaded_checked_and_used(http, monkeypatch):
 
 def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
     heads = [HEAD + n * b"# the same head again\n" for n in (1000, 20_000)]
-    answers: list[int] = []
+    responses: list[int] = []
 
     def put(head: bytes) -> None:
-        answers.append(http.put("/uploads/anna/head.obj", content=head).status_code)
+        responses.append(http.put("/uploads/anna/head.obj", content=head).status_code)
 
     for _ in range(10):
         threads = [threading.Thread(target=put, args=(head,)) for head in heads]
@@ -295,24 +295,24 @@ def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
         for thread in threads:
             thread.join()
         assert (http.service.root / "uploads" / "anna" / "head.obj").read_bytes() in heads
-    assert answers == 20 * [200]
+    assert responses == 20 * [200]
 
 
 def test_what_is_deleted_twice_at_once_is_deleted_once(http):
     root = http.service.root
     removed = {"kind": "capture", "by": "eve", "removed": "2026-01-01T00:00:00.000+00:00"}
-    answers: list[int] = []
+    responses: list[int] = []
 
     def delete(path: str) -> None:
-        answers.append(http.delete(path).status_code)
+        responses.append(http.delete(path).status_code)
 
     for _ in range(10):
         for name in ("a", "b", "c"):
             (root / "uploads" / name / "masks").mkdir(parents=True)
             place = root / "trash" / f"20260101-000000-{name}"
             (place / name).mkdir(parents=True)
-            told = {**removed, "name": place.name, "id": name, "bytes": 0}
-            (place / "removed.json").write_text(json.dumps(told))
+            reported = {**removed, "name": place.name, "id": name, "bytes": 0}
+            (place / "removed.json").write_text(json.dumps(reported))
             for i in range(50):
                 (place / name / f"{i}").touch()
                 (root / "uploads" / name / "masks" / f"{i}.png").touch()
@@ -323,8 +323,8 @@ def test_what_is_deleted_twice_at_once_is_deleted_once(http):
                 thread.start()
             for thread in threads:
                 thread.join()
-    assert set(answers) <= {200, 404}
-    assert answers.count(404) <= 30
+    assert set(responses) <= {200, 404}
+    assert responses.count(404) <= 30
     assert http.get("/trash").json() == http.get("/uploads").json() == []
 
 
@@ -361,9 +361,9 @@ def test_a_refusal_reaches_a_client_that_sends_on(http):
         connection.sendall(head.encode())
         connection.recv(1, socket.MSG_PEEK)  # the refusal is there
         connection.sendall(size * b" ")
-        answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
-    assert answer.startswith(b"HTTP/1.1 413")
-    assert json.loads(answer.partition(b"\r\n\r\n")[2])["type"].endswith("too-large")
+        response = b"".join(iter(lambda: connection.recv(1 << 16), b""))
+    assert response.startswith(b"HTTP/1.1 413")
+    assert json.loads(response.partition(b"\r\n\r\n")[2])["type"].endswith("too-large")
 
 
 def test_the_command_line_of_the_store(http, tmp_path, capsys):
@@ -415,7 +415,7 @@ def test_the_command_line_lists_all_there_are(http, capsys, monkeypatch):
     assert listed == [capture["id"], *(f"c{i:04d}" for i in range(1100))]
 
 
-def test_what_is_no_service_of_ours_is_told_so(capsys):
+def test_a_foreign_service_is_reported_as_such(capsys):
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(404 if self.path == "/health" else 200)
@@ -430,7 +430,7 @@ def test_what_is_no_service_of_ours_is_told_so(capsys):
         for words in (["stage", "status"], ["lease", "show"]):
             url = f"http://127.0.0.1:{server.server_port}"
             assert main([*words, "--url", url]) == 4
-            told = capsys.readouterr().err
-            assert "no document of hairstage" in told
-            assert "Traceback" not in told
+            reported = capsys.readouterr().err
+            assert "no document of hairstage" in reported
+            assert "Traceback" not in reported
         server.shutdown()

@@ -23,12 +23,12 @@ SHORT = {"plan": {"lights": ["light_003", "light_000"], "projectors": []}}
 
 def figures(http: Client) -> dict[tuple[str, ...], float]:
     """What `/metrics` says, as Prometheus's own reader reads it: (name, label values…) → value."""
-    answer = http.get("/metrics")
-    assert answer.status_code == 200, answer.text
-    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    response = http.get("/metrics")
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"].startswith("text/plain; version=0.0.4")
     return {
         (sample.name.removeprefix("hairstage_"), *sample.labels.values()): sample.value
-        for family in text_string_to_metric_families(answer.text)
+        for family in text_string_to_metric_families(response.text)
         for sample in family.samples
     }
 
@@ -71,9 +71,7 @@ def test_frames_captures_and_faults_are_counted(rig_file, world, tmp_path):
         assert figures(http)["device_reachable", "lights"] == 1
 
 
-def test_a_frame_that_is_missing_is_counted_once_however_often_its_capture_goes_on(
-    rig_file, world, tmp_path
-):
+def test_a_missing_frame_is_counted_once_over_repeated_resumes(rig_file, world, tmp_path):
     with serving(rig_file, tmp_path) as http:
         world.drop = {("cam_1", 3)}
         plan = {"projectors": [], "retries": 0}
@@ -88,27 +86,27 @@ def test_a_frame_that_is_missing_is_counted_once_however_often_its_capture_goes_
         http.post("/devices/blackout")
 
 
-def test_workers_disk_and_jobs_are_as_they_were_last_seen(rig_file, tmp_path, monkeypatch):
+def test_workers_disk_and_jobs_are_those_of_the_last_query(rig_file, tmp_path, monkeypatch):
     slot = WorkerSlot(tmp_path)
     usage = namedtuple("usage", "total used free")(10**12, 0, 5 * 10**11)
     with serving(rig_file, tmp_path) as http:
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
         until(lambda: ("jobs", "queued") in figures(http), pause=0.1)
-        seen = figures(http)
-        assert seen["jobs", "queued"] == seen["jobs", "running"] == 0
-        assert seen[("job_database_up",)] == 1
-        assert seen[("disk_free_bytes",)] == 5e11
+        observed = figures(http)
+        assert observed["jobs", "queued"] == observed["jobs", "running"] == 0
+        assert observed[("job_database_up",)] == 1
+        assert observed[("disk_free_bytes",)] == 5e11
         name = f"{slot.host}/{slot.name}"
-        assert seen["worker_alive", name] == 1
-        assert 0 <= seen["worker_heartbeat_age_seconds", name] < 60
+        assert observed["worker_alive", name] == 1
+        assert 0 <= observed["worker_heartbeat_age_seconds", name] < 60
         slot.release()
         assert figures(http)["worker_alive", name] == 0
         assert http.get("/ready").json() == {"ready": True}
 
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10**7))
-        answer = http.get("/ready").json()
-        assert (answer["status"], answer["type"]) == (503, "/docs/errors.md#not-ready")
-        assert "10 MB free" in answer["problems"][0]
+        response = http.get("/ready").json()
+        assert (response["status"], response["type"]) == (503, "/docs/errors.md#not-ready")
+        assert "10 MB free" in response["problems"][0]
 
         monkeypatch.setattr(watching, "SILENT_S", 0.0)
         free = threading.Event()
@@ -118,7 +116,7 @@ def test_workers_disk_and_jobs_are_as_they_were_last_seen(rig_file, tmp_path, mo
         free.set()
 
 
-def test_a_disk_that_has_gone_is_told_and_nothing_is_shot_in_its_place(rig_file, world, tmp_path):
+def test_a_missing_disk_is_reported_and_no_folder_replaces_it(rig_file, world, tmp_path):
     with serving(rig_file, tmp_path) as http:
         (tmp_path / "captures").rename(tmp_path / "unmounted")
         assert "check its disk" in http.get("/ready").json()["problems"][0]
@@ -131,14 +129,14 @@ def test_a_disk_that_has_gone_is_told_and_nothing_is_shot_in_its_place(rig_file,
         assert http.get("/ready").json() == {"ready": True}
 
 
-def test_neither_asks_the_job_database(rig_file, tmp_path, monkeypatch):
+def test_neither_queries_the_job_database(rig_file, tmp_path, monkeypatch):
     monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", "postgresql://nobody@127.0.0.1:1/nothing")
     with serving(rig_file, tmp_path) as http:
         until(lambda: figures(http)[("job_database_up",)] == 0, pause=0.1)
         assert http.get("/ready").status_code == 200
 
 
-def test_it_is_not_ready_while_nobody_knows_whether_it_is_dark(rig_file, world, tmp_path):
+def test_the_service_is_not_ready_while_darkness_is_unknown(rig_file, world, tmp_path):
     with serving(rig_file, tmp_path) as http:
         world.deaf_lights = True
         assert http.post("/devices/blackout").json()["state"] == "unknown, unsafe"

@@ -430,8 +430,8 @@ class Stage(RuleBasedStateMachine):
     @rule(person=PEOPLE)
     def blackout(self, person: str) -> None:
         self.withdraw()
-        answer = self.service.blackout(self.by(person))
-        if answer["state"] == "dark":
+        response = self.service.blackout(self.by(person))
+        if response["state"] == "dark":
             assert not self.world.lit
             assert self.world.show == "OFF"
         if not self.reads_back:
@@ -720,7 +720,7 @@ def run(
     return done
 
 
-def test_no_lamp_goes_on_without_permission(monkeypatch, tmp_path, wire, world):
+def test_no_lamp_is_lit_without_permission(monkeypatch, tmp_path, wire, world):
     done = run(monkeypatch, tmp_path, wire, world, examples=50, steps=15, derandomize=True)
     assert done["steps"] >= 500
     assert done["lights"] > 0
@@ -728,7 +728,7 @@ def test_no_lamp_goes_on_without_permission(monkeypatch, tmp_path, wire, world):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_no_lamp_goes_on_without_permission_in_ten_thousand_steps(
+def test_no_lamp_is_lit_without_permission_in_ten_thousand_steps(
     monkeypatch, tmp_path, wire, world
 ):
     done = run(monkeypatch, tmp_path, wire, world, examples=480, steps=25, derandomize=False)

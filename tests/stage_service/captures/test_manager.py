@@ -90,7 +90,7 @@ def test_one_capture_at_a_time_and_steering(manager, world):
     until(manager, "capture.state", state="paused")
     assert not world.lit
     assert manager.get(first).state == "paused"
-    assert seen(manager)["lights"]["state"] == "ok"
+    assert observed(manager)["lights"]["state"] == "ok"
     manager.resume(first)
     manager.abort(first)
     status = manager.wait(first, 20)
@@ -144,20 +144,20 @@ def test_blackout_without_a_capture(manager, world):
     assert not world.lit
     assert world.show == "OFF"
     world.lit, world.stuck_lamps = {7}, True
-    answer = manager.blackout()
-    assert not answer["safe"]
-    assert "unknown, unsafe" in answer["detail"]
+    response = manager.blackout()
+    assert not response["safe"]
+    assert "unknown, unsafe" in response["detail"]
 
 
-def seen(manager: CaptureManager) -> dict[str, Any]:
+def observed(manager: CaptureManager) -> dict[str, Any]:
     """What the devices said, once they have answered or their deadlines are over."""
     return waited(lambda: d if (d := manager.devices())["age_s"] is not None else None)
 
 
-def test_devices_are_asked_one_by_one(manager, world):
+def test_devices_are_queried_one_by_one(manager, world):
     world.estop = True
     world.late = ["ID?"]
-    devices = seen(manager)
+    devices = observed(manager)
     assert devices["lights"]["estop_pressed"] is True
     assert devices["lights"]["count"] == 200
     assert devices["trigger"]["state"] == "unreachable"
@@ -187,7 +187,7 @@ def test_an_interrupted_capture_is_listed_after_a_restart(manager, rig_file, wor
     again.close()
 
 
-def test_a_follow_up_that_fails_is_told_and_the_capture_stays_completed(rig_file, tmp_path, world):
+def test_a_failed_follow_up_is_reported_and_the_capture_stays_completed(rig_file, tmp_path, world):
     def broken(_status: Any) -> None:
         raise RuntimeError("no queue")
 

@@ -57,7 +57,7 @@ def leaves(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Argu
             yield from leaves(child)
 
 
-def test_every_command_says_what_it_does_and_speaks_json():
+def test_every_command_has_help_and_json_output():
     commands = dict(leaves(build_parser()))
     names = {" ".join(name.split()[1:]) for name in commands}
     assert {"demo", "serve", "worker", "simulate", "verify", "import"} <= names
@@ -76,8 +76,8 @@ def test_where_no_terminal_is_a_line_says_each_end_that_is_reached(capsys):
     with progress_bar("bench") as progress:
         for what, share in [("one", 0.0), ("one", 1.0), ("one", 1.0), ("two", 0.5), ("two", 1.0)]:
             progress(what, share)
-    told = capsys.readouterr().err.splitlines()
-    assert told == ["bench:   0% one", "bench: 100% one", "bench: 100% two"]
+    shown_text = capsys.readouterr().err.splitlines()
+    assert shown_text == ["bench:   0% one", "bench: 100% one", "bench: 100% two"]
 
 
 def test_help_is_fast_because_nothing_heavy_is_imported():
@@ -131,12 +131,14 @@ def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
 def test_a_plan_that_cannot_be_read_is_named(capsys, tmp_path, data):
     plan = tmp_path / "plan.json"
     plan.write_bytes(data)
-    code, told = run(capsys, "capture", "check", "--rig", "demo", "--plan", plan)
+    code, shown_text = run(capsys, "capture", "check", "--rig", "demo", "--plan", plan)
     assert code == 3
-    assert told["error"]["detail"].startswith(f"{plan} is not JSON: ")
+    assert shown_text["error"]["detail"].startswith(f"{plan} is not JSON: ")
 
 
-def test_what_a_service_cannot_use_is_told_before_a_device_is_asked(capsys, tmp_path, monkeypatch):
+def test_invalid_service_options_are_refused_before_a_device_is_queried(
+    capsys, tmp_path, monkeypatch
+):
     def never(*_: object, **_more: object) -> None:
         raise AssertionError("a service was made")
 
@@ -244,7 +246,7 @@ def test_an_unreachable_service_is_exit_code_4(capsys):
     assert "hairstage serve" in data["error"]["detail"]
 
 
-def test_verify_tells_sound_from_damaged(capsys, tmp_path):
+def test_verify_distinguishes_intact_from_damaged_captures(capsys, tmp_path):
     rig = Rig.from_dict(
         {
             "cameras": [
@@ -275,7 +277,7 @@ def test_verify_tells_sound_from_damaged(capsys, tmp_path):
     assert "00001/cam.exr" in data["problems"][0]
 
 
-def test_reconstruct_tells_what_it_would_take(capsys, tmp_path):
+def test_reconstruct_reports_its_cost(capsys, tmp_path):
     cameras = [
         Camera.look_at(name, 40, 30, (x, -1, 0), (0, 0, 0), 20.0)
         for name, x in (("left", -0.2), ("right", 0.2))
@@ -367,7 +369,7 @@ def test_what_is_wrong_is_one_sentence_that_names_it_before_any_work(
     assert said in data["error"]["detail"]
 
 
-def test_another_unit_is_told_before_what_it_makes_long(capsys, tmp_path, monkeypatch):
+def test_wrong_unit_is_reported_before_the_evaluation_ends(capsys, tmp_path, monkeypatch):
     line = np.array([[0, 0, 0], [0, 0, 0.1]])
     write_strands(tmp_path / "true.npz", Strands.from_list([line]))
     write_strands(tmp_path / "mm.npz", Strands.from_list([1e3 * line]))
@@ -394,7 +396,7 @@ def test_evaluate_geometry_leaves_a_models_report_alone(capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_evaluate_geometry_fills_a_folder_and_tells_of_bad_input(capsys, tmp_path):
+def test_evaluate_geometry_fills_a_folder_and_reports_bad_input(capsys, tmp_path):
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(200, 3))
     roots *= 0.09 / np.linalg.norm(roots, axis=1, keepdims=True)
@@ -520,7 +522,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-def test_children_end_with_their_command_and_their_last_words_are_told(tmp_path):
+def test_children_end_with_their_command_and_their_last_output_is_reported(tmp_path):
     sleeper = [sys.executable, "-c", "import time; print('{}', flush=True); time.sleep(60)"]
     failing = [sys.executable, "-c", "raise SystemExit('no such camera')"]
     pids = []
@@ -585,10 +587,10 @@ def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
     code, cost = run(capsys, *words)
     assert (code, cost["frames"]) == (0, 50 * (331 + 3 * (768 + 76) + 4))
     assert main([*map(str, words)]) == 0
-    told = capsys.readouterr().out
-    assert "limited by link" in told
-    assert "the trigger box clocks 2867 of 2867 steps" in told
-    assert "needs consent, or rate_hz" in told
+    shown_text = capsys.readouterr().out
+    assert "limited by link" in shown_text
+    assert "the trigger box clocks 2867 of 2867 steps" in shown_text
+    assert "needs consent, or rate_hz" in shown_text
     plan = tmp_path / "plan.json"
     plan.write_text('{"lights": ["lamp"]}')
     code, data = run(capsys, *words, "--plan", plan)

@@ -17,7 +17,7 @@ from reconstruction.head.generic import generic_head
 from stage_service.cli import main
 
 
-def test_a_head_is_laid_under_points_of_its_scalp(
+def test_a_head_is_fitted_to_points_of_its_scalp(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     head = generic_head()
@@ -66,7 +66,7 @@ def egg() -> Mesh:
 
 
 @pytest.mark.slow
-def test_a_mesh_whose_face_cannot_be_told_is_warned_of(
+def test_a_mesh_without_a_recognised_face_gives_a_warning(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     own, head = tmp_path / "egg.obj", generic_head()
@@ -84,7 +84,7 @@ def test_a_mesh_whose_face_cannot_be_told_is_warned_of(
     assert any("egg.obj: its scalp: another pose" in w for w in stage.warnings)
 
 
-def test_what_is_wrong_is_said_with_exit_code_3(
+def test_errors_are_reported_with_exit_code_3(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     np.save(tmp_path / "few.npy", np.eye(3))

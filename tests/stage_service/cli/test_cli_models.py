@@ -111,7 +111,7 @@ def fitted(made):
     return json.loads(printed.getvalue())
 
 
-def test_a_render_of_fitted_maps_is_nearer_to_a_frame_that_no_fit_has_seen(made, fitted, capsys):
+def test_a_render_of_fitted_maps_is_nearer_to_a_held_out_frame(made, fitted, capsys):
     """Inverse rendering runs Sun's fit first, which leaves one material for all hair."""
     found = fitted
     assert found["appearance"] == made.model.json("appearance.json")
@@ -145,9 +145,7 @@ def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
 
 
 @pytest.mark.usefixtures("fitted")
-def test_a_field_goes_on_the_fit_that_is_there_but_where_options_ask_for_another(
-    made, capsys, monkeypatch
-):
+def test_a_field_uses_the_existing_fit_unless_options_request_another(made, capsys, monkeypatch):
     called = []
     for name in ("fit", "fields"):
         monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
@@ -212,7 +210,7 @@ def test_edits_are_saved_as_a_model_of_their_own(made, capsys, tmp_path):
 
 
 @pytest.mark.usefixtures("fitted")
-def test_an_edited_model_keeps_its_scalps_map_and_tells_of_its_own_material(made, capsys, tmp_path):
+def test_an_edited_model_keeps_its_scalp_map_and_shows_its_material(made, capsys, tmp_path):
     before = Model(shutil.copytree(made.model.path, tmp_path / "before"))
     strands, roots = before.strands(), FittedModel.load(before).root_uv
     known = {"uv": np.zeros((3, 2)), "vertices": np.eye(3), "faces": np.array([[0, 1, 2]])}
@@ -232,7 +230,7 @@ def test_an_edited_model_keeps_its_scalps_map_and_tells_of_its_own_material(made
 
 
 @pytest.mark.usefixtures("fitted")
-def test_other_strands_in_another_unit_are_told(made, capsys, tmp_path):
+def test_strands_in_another_unit_give_a_warning(made, capsys, tmp_path):
     strands = made.model.strands()
     for scale, said in ((1, False), (100, True)):
         write_strands(tmp_path / "s.npz", Strands(scale * strands.points, strands.offsets))
@@ -298,8 +296,8 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     ],
 )
 def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
-    asked = [str(made.model), *(w.format(capture=made.capture) for w in words)]
-    code, found = run(capsys, "render", *asked)
+    arguments = [str(made.model), *(w.format(capture=made.capture) for w in words)]
+    code, found = run(capsys, "render", *arguments)
     assert code == 3
     assert said in found["error"]["detail"]
 
@@ -313,7 +311,7 @@ def test_a_picture_makes_its_folder(made, capsys, tmp_path):
 
 
 @pytest.mark.usefixtures("fitted")
-def test_exports_tell_of_what_they_do_not_hold(made, capsys, tmp_path, monkeypatch):
+def test_exports_warn_about_omitted_data(made, capsys, tmp_path, monkeypatch):
     model = Model(shutil.copytree(made.model.path, tmp_path / "model"))
     capture = shutil.copytree(made.capture, tmp_path / "moved")
     plan = json.loads((capture / "plan.json").read_text())
@@ -333,7 +331,7 @@ def test_exports_tell_of_what_they_do_not_hold(made, capsys, tmp_path, monkeypat
 
 
 @pytest.mark.usefixtures("fitted")
-def test_a_scene_for_mitsuba_tells_of_the_lens_that_it_leaves_out(made, capsys, tmp_path):
+def test_a_mitsuba_scene_warns_about_the_omitted_lens(made, capsys, tmp_path):
     """Its rows are 9.5 pixels from the middle at most, and 9.5 / 1.2 where a pixel is as high as
     wide; the lens puts at the corner what is two pixels outside of it without one."""
     capture = shutil.copytree(made.capture, tmp_path / "capture")
@@ -349,8 +347,8 @@ def test_a_scene_for_mitsuba_tells_of_the_lens_that_it_leaves_out(made, capsys, 
         (capture / "rig.json").write_text(json.dumps(rig | {"cameras": cameras}))
         for name, off in zip(("cam_0", "cam_1"), said, strict=True):
             assert main([*words, "--camera", name, "--out", str(tmp_path / name)]) == 0
-            told = capsys.readouterr().err
-            assert (f"{name} has lens distortion" in told, off in told) == (off != "", True)
+            output = capsys.readouterr().err
+            assert (f"{name} has lens distortion" in output, off in output) == (off != "", True)
 
 
 def test_a_head_without_hair_is_a_scene_for_mitsuba_where_a_camera_is_given(made, capsys, tmp_path):

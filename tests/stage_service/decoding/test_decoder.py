@@ -127,12 +127,12 @@ def test_a_file_that_takes_longer_than_its_limit_is_refused(decoder, limits, why
 
 
 def test_a_decoder_that_dies_is_named_and_the_next_file_has_another(decoder):
-    process, told = pid(decoder), []
+    process, reported = pid(decoder), []
 
     def read() -> None:
         with pytest.raises(Undecodable) as error:
             decoder.head(SLOW, "head.obj")
-        told.append(str(error.value))
+        reported.append(str(error.value))
 
     for victim, number in ((lambda: forks(process), signal.SIGSEGV), (lambda: [process], 9)):
         thread = threading.Thread(target=read)
@@ -141,9 +141,9 @@ def test_a_decoder_that_dies_is_named_and_the_next_file_has_another(decoder):
         for one in victim():
             os.kill(one, number)
         thread.join()
-    assert told[0].startswith("head.obj: decoding it crashed")
-    assert told[0].endswith("SIGSEGV")
-    assert told[1].startswith("head.obj: decoding it crashed")
+    assert reported[0].startswith("head.obj: decoding it crashed")
+    assert reported[0].endswith("SIGSEGV")
+    assert reported[1].startswith("head.obj: decoding it crashed")
     assert len(decoder.head(bombs.obj(2), "head.obj").faces) == 2
 
 
@@ -185,7 +185,7 @@ time.sleep(600)
     until(lambda: gone(int((tmp_path / "fork").read_text())))
 
 
-def test_those_that_find_no_place_are_told_so_at_once(decoder, monkeypatch):
+def test_requests_to_a_full_decoder_are_refused_at_once(decoder, monkeypatch):
     monkeypatch.setattr(side, "WAIT_S", 0.05)
     with decoder.given.place():
         with pytest.raises(DecoderBusy, match=r"0\.05 s"):
@@ -206,7 +206,7 @@ def test_nothing_is_begun_after_the_end(decoder):
 
 
 @pytest.mark.parametrize(
-    ("told", "parts"),
+    ("reported", "parts"),
     [
         ({"dtype": "|O", "shape": [1, 3]}, [bytearray(24)]),
         ({"dtype": "<f8", "shape": [1, 4]}, [bytearray(32)]),
@@ -217,14 +217,14 @@ def test_nothing_is_begun_after_the_end(decoder):
         ({"dtype": "<f8", "shape": [1, 3]}, []),
     ],
 )
-def test_answers_that_are_no_arrays_of_the_expected_kind_are_refused(told, parts):
+def test_results_that_are_no_arrays_of_the_expected_kind_are_refused(reported, parts):
     with pytest.raises(Undecodable, match="no valid arrays"):
-        side._arrays("a", {"arrays": [told]}, parts, [("<f8", (None, 3))])
+        side._arrays("a", {"arrays": [reported]}, parts, [("<f8", (None, 3))])
     fine = {"arrays": [{"dtype": "<f8", "shape": [1, 3]}]}
     assert side._arrays("a", fine, [bytearray(24)], [("<f8", (None, 3))])[0].shape == (1, 3)
 
 
-def test_an_answer_that_is_too_large_is_not_read():
+def test_a_result_that_is_too_large_is_not_read():
     ours, theirs = socket.socketpair()
     with ours, theirs:
         framing.send(theirs, {}, [bytes(100)])
@@ -240,7 +240,7 @@ def test_an_answer_that_is_too_large_is_not_read():
             framing.receive(ours, 99)
 
 
-def test_a_frame_that_is_gone_and_one_that_is_none_are_told_apart(decoder, tmp_path):
+def test_missing_and_invalid_frames_raise_different_errors(decoder, tmp_path):
     with pytest.raises(FileNotFoundError):
         decoder.preview(tmp_path / "gone.exr")
     (tmp_path / "none.exr").write_bytes(b"none")

@@ -170,7 +170,7 @@ def assert_mosaic(rgb: np.ndarray, shots: list[np.ndarray], order: str) -> int:
 
 
 @pytest.mark.parametrize("order", sorted(SITES))
-def test_every_bayer_order_is_told_apart(make, shots, order):
+def test_every_bayer_order_is_recognised(make, shots, order):
     camera = make(pixel_format=f"Bayer{order}12")
     camera.connect()
     camera.arm(EXPOSURE)
@@ -205,7 +205,7 @@ def test_an_overtrigger_leaves_no_gap(camera):
         account.arrived(block_id)
 
 
-def test_a_frame_that_nobody_asked_for_is_told_without_a_clock(camera):
+def test_an_unexpected_frame_is_detected_without_a_clock(camera):
     account = FrameAccount(camera.name, camera.capabilities.block_wrap)
     camera.arm(EXPOSURE)
     for _ in range(3):
@@ -232,7 +232,7 @@ def test_a_damaged_frame_is_a_lost_frame(camera):
     assert frame.block_id == 2
 
 
-def test_two_cameras_are_told_apart_by_serial_number(camera, make):
+def test_two_cameras_are_identified_by_serial_number(camera, make):
     other = make(name="right")
     other.connect()
     for one in (camera, other):
@@ -247,7 +247,7 @@ def features(**changed: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "message"),
     [
         (features(Width=64), "expected 32x24 pixels as in the rig file, received 64x24"),
         (features(Width=99999), "setting Width to 99999: expected 1 to 4096, received 99999"),
@@ -258,16 +258,16 @@ def features(**changed: object) -> dict[str, object]:
         ({"serials": {"middle": "0815-0000"}}, "serials in"),
     ],
 )
-def test_a_camera_that_is_not_the_rig_file_s_is_told(make, fields, told):
+def test_a_camera_that_mismatches_the_rig_file_is_reported(make, fields, message):
     camera = make(**fields)
     with pytest.raises(DeviceError, match="camera left") as error:
         camera.connect()
-    assert told in str(error.value)
+    assert message in str(error.value)
     with pytest.raises(DeviceUnreachable, match="expected an open camera"):
         camera.arm(EXPOSURE)
 
 
-def test_a_pixel_format_that_the_camera_lacks_is_told(make):
+def test_an_unsupported_pixel_format_is_reported(make):
     camera = make()
     camera.connect()
     with pytest.raises(
@@ -277,10 +277,10 @@ def test_a_pixel_format_that_the_camera_lacks_is_told(make):
 
 
 @pytest.mark.parametrize(
-    ("exposure", "told"), [(20.0, "expected 1 to 1e"), (1.4e-6, "received 1e-06 s")]
+    ("exposure", "message"), [(20.0, "expected 1 to 1e"), (1.4e-6, "received 1e-06 s")]
 )
-def test_an_exposure_that_the_camera_lacks_is_told(camera, exposure, told):
-    with pytest.raises(DeviceError, match=told):
+def test_an_unsupported_exposure_is_reported(camera, exposure, message):
+    with pytest.raises(DeviceError, match=message):
         camera.arm(exposure)
     assert camera.read(NEVER) is None
 
@@ -293,7 +293,7 @@ def test_frames_of_another_size_are_refused(camera):
         camera.read(NEVER)
 
 
-def test_without_pypylon_it_is_told_how_to_install_it(make, monkeypatch):
+def test_without_pypylon_the_error_names_the_install_command(make, monkeypatch):
     monkeypatch.setitem(sys.modules, "pypylon", None)
     with pytest.raises(DeviceUnreachable, match=r"pip install 'hairstage\[basler\]'"):
         make().connect()

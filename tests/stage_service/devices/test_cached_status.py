@@ -11,9 +11,9 @@ def test_who_found_no_thread_to_look_with_looks_the_next_time(monkeypatch):
     def none_left(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    seen = CachedStatus(lambda: {"free": 5}, {"free": None})
+    observed = CachedStatus(lambda: {"free": 5}, {"free": None})
     with monkeypatch.context() as full:
         full.setattr(threading.Thread, "start", none_left)
-        assert seen.get() == {"free": None, "age_s": None}
-        assert seen.running_s() == 0
-    assert seen.get()["free"] == 5
+        assert observed.get() == {"free": None, "age_s": None}
+        assert observed.running_s() == 0
+    assert observed.get()["free"] == 5

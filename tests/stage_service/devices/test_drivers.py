@@ -59,9 +59,9 @@ def test_heartbeats_come_while_it_runs_and_trouble_is_kept(stage, world, monkeyp
             heartbeat.check()
         monkeypatch.undo()
         until(lambda: heartbeat.error is None)
-    seen = world.heartbeats
+    observed = world.heartbeats
     assert threading.Event().wait(0.05) is False
-    assert world.heartbeats == seen
+    assert world.heartbeats == observed
 
 
 def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):
@@ -112,18 +112,18 @@ def test_a_device_that_talks_on_and_on_is_given_up_at_its_deadline():
 def test_a_widget_that_sends_on_and_on_does_not_hold_its_lamps():
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
-    asked, shown = 0, b""
+    requests, shown = 0, b""
 
     def widget() -> None:
-        nonlocal asked, shown
+        nonlocal requests, shown
         with contextlib.suppress(OSError):
             while True:
                 came = os.read(ours, 4096)
                 shown = came[: came.find(b"\xe7") + 1] if came[1] == 6 else shown
-                asked += (wanted := b"\x7e\x03" in came)
-                if wanted and asked == 1:  # without the bytes that were asked for
+                requests += (wanted := b"\x7e\x03" in came)
+                if wanted and requests == 1:  # without the bytes that were asked for
                     os.write(ours, b"\x7e\x03\x05\x00\x90\x01\x09\x01\x28\xe7")
-                if asked > 2:  # what it hears of DMX, over and over
+                if requests > 2:  # what it hears of DMX, over and over
                     while True:
                         os.write(ours, 50 * b"\x7e\x05\x03\x00\x00\x00\x01\xe7")
 
@@ -138,7 +138,7 @@ def test_a_widget_that_sends_on_and_on_does_not_hold_its_lamps():
     bank.connect()
     with pytest.raises(DeviceTimeout, match="putting lamp 3 on"):
         bank.select(3)
-    asked += 1
+    requests += 1
     found: list[Exception] = []
 
     def off() -> None:
@@ -205,11 +205,11 @@ FRAME = {"block_id": 1, "timestamp": 2.5, "exposure": 0.02, "left": 0, "bytes": 
     ("hello", "field"), [*((True, f) for f in HELLO), *((False, f) for f in FRAME)]
 )
 def test_what_is_no_number_is_an_error_that_names_the_camera(rig_file, hello, field, value):
-    told = [HELLO | {field: value}, {}] if hello else [HELLO, {}, FRAME | {field: value}]
+    replies = [HELLO | {field: value}, {}] if hello else [HELLO, {}, FRAME | {field: value}]
 
     def peer() -> None:
         with contextlib.suppress(OSError, struct.error), listener.accept()[0] as link:
-            for fields in told:
+            for fields in replies:
                 link.recv(struct.unpack(">I", link.recv(4, socket.MSG_WAITALL))[0])
                 text = json.dumps({"ok": True, "status": "frame", **fields}).encode()
                 link.sendall(struct.pack(">I", len(text)) + text + bytes(288 * ("left" in fields)))

@@ -65,13 +65,13 @@ def rig(slack: int) -> Iterator[Rig]:
     rig.stop()
 
 
-def peer(answers: Callable[[socket.socket], None]) -> tuple[int, threading.Thread]:
+def peer(reply_with: Callable[[socket.socket], None]) -> tuple[int, threading.Thread]:
     """A server of one connection that says exactly what a test wants."""
     listening = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
         with listening, listening.accept()[0] as link:
-            answers(link)
+            reply_with(link)
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
@@ -112,24 +112,24 @@ def test_a_projector_that_counts_no_lamps_has_none(rig: Rig) -> None:
 
 def test_the_digest_is_that_of_the_protocols_example() -> None:
     """PJLink Specifications 1.04: seed 498e4a67, password JBMIAProjectorLink."""
-    asked = b""
+    request_bytes = b""
 
-    def answers(link: socket.socket) -> None:
-        nonlocal asked
+    def reply_with(link: socket.socket) -> None:
+        nonlocal request_bytes
         link.sendall(b"PJLINK 1 498e4a67\r")
-        asked = link.recv(100)
+        request_bytes = link.recv(100)
         link.sendall(b"%1POWR=1\r")
 
-    port, thread = peer(answers)
+    port, thread = peer(reply_with)
     projector = PjLinkProjector("front", "127.0.0.1", port, PASSWORD)
     assert projector.power() is Power.ON
     thread.join()
-    assert asked == b"5d8409bc1c3fa39749434aa3a5c38682%1POWR ?\r"
-    assert asked[:32] == hashlib.md5(b"498e4a67" + PASSWORD.encode()).hexdigest().encode()
+    assert request_bytes == b"5d8409bc1c3fa39749434aa3a5c38682%1POWR ?\r"
+    assert request_bytes[:32] == hashlib.md5(b"498e4a67" + PASSWORD.encode()).hexdigest().encode()
 
 
 @pytest.mark.parametrize(("given", "received"), [("", "a greeting"), ("wrong", "ERRA")])
-def test_a_wrong_password_is_named_and_not_told(rig: Rig, given: str, received: str) -> None:
+def test_a_wrong_password_is_reported_without_its_text(rig: Rig, given: str, received: str) -> None:
     projector = rig.projector(PASSWORD, given)
     with pytest.raises(DeviceError, match=f"expected the right password.*{received}") as caught:
         projector.switch(True)
@@ -157,7 +157,7 @@ def test_standby_is_refused_during_warm_up_as_not_now(rig: Rig) -> None:
         ("failure", DeviceError, "ERR4, a failure of the projector"),
     ],
 )
-def test_each_fault_of_the_wire_is_told_and_does_not_reach_the_next_question(
+def test_each_wire_fault_is_reported_and_does_not_affect_the_next_request(
     rig: Rig, fault: str, kind: type[DeviceError], text: str
 ) -> None:
     projector = rig.projector()
@@ -180,7 +180,7 @@ def test_each_fault_of_the_wire_is_told_and_does_not_reach_the_next_question(
         ("garbage", DeviceError, "a greeting like PJLINK 0"),
     ],
 )
-def test_a_broken_greeting_is_told_and_nothing_is_switched(
+def test_a_broken_greeting_is_reported_and_nothing_is_switched(
     rig: Rig, fault: str, kind: type[DeviceError], text: str
 ) -> None:
     projector = rig.projector()
@@ -198,47 +198,47 @@ def test_nobody_there_is_unreachable() -> None:
         PjLinkProjector("front", "127.0.0.1", port).power()
 
 
-@pytest.mark.parametrize("answer", [b"%1POWR=7\r", b"%1LAMP=0\r", b"%2POWR=0\r", b"x" * 500])
-def test_an_answer_out_of_the_protocol_is_refused(answer: bytes) -> None:
-    def answers(link: socket.socket) -> None:
+@pytest.mark.parametrize("wrong_reply", [b"%1POWR=7\r", b"%1LAMP=0\r", b"%2POWR=0\r", b"x" * 500])
+def test_a_reply_outside_the_protocol_is_refused(wrong_reply: bytes) -> None:
+    def reply_with(link: socket.socket) -> None:
         link.sendall(b"PJLINK 0\r")
         link.recv(100)
-        link.sendall(answer)
+        link.sendall(wrong_reply)
 
-    port, thread = peer(answers)
+    port, thread = peer(reply_with)
     with pytest.raises(DeviceError, match="expected %1POWR= and 0, 1, 2 or 3 within"):
         PjLinkProjector("front", "127.0.0.1", port).power()
     thread.join()
 
 
-def test_lower_case_answers_are_read() -> None:
-    asked = b""
+def test_lower_case_replies_are_read() -> None:
+    request_bytes = b""
 
-    def answers(link: socket.socket) -> None:
-        nonlocal asked
+    def reply_with(link: socket.socket) -> None:
+        nonlocal request_bytes
         link.sendall(b"pjlink 0\r")
-        asked = link.recv(100)
+        request_bytes = link.recv(100)
         link.sendall(b"%1powr=ok\r")
 
-    port, thread = peer(answers)
+    port, thread = peer(reply_with)
     PjLinkProjector("front", "127.0.0.1", port).switch(True)
     thread.join()
-    assert asked == b"%1POWR 1\r"
+    assert request_bytes == b"%1POWR 1\r"
 
 
 def test_several_lamps_are_read() -> None:
-    def answers(link: socket.socket) -> None:
+    def reply_with(link: socket.socket) -> None:
         link.sendall(b"PJLINK 0\r")
         link.recv(100)
         link.sendall(b"%1LAMP=12 1 99999 0\r")
 
-    port, thread = peer(answers)
+    port, thread = peer(reply_with)
     lamps = PjLinkProjector("front", "127.0.0.1", port).lamps()
     thread.join()
     assert lamps == (Lamp(12, True), Lamp(99_999, False))
 
 
-def test_the_simulated_projector_answers_what_it_does_not_know_with_errors() -> None:
+def test_the_simulated_projector_replies_to_unknown_commands_with_errors() -> None:
     projector = SimulatedProjector()
     assert projector.reply("%1POWR 2") == "%1POWR=ERR2"
     assert projector.reply("%1INPT ?") == "%1INPT=ERR1"

@@ -111,7 +111,7 @@ WHY = {"down": "Connection refused", "deaf": "connection timeout expired"}
 MEANWHILE = "Captures and blackout work meanwhile; jobs resume by themselves once it is back."
 
 
-def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatch, tmp_path):
+def test_a_database_that_is_down_or_silent_is_reported_in_a_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(queues, "CONNECT_S", 2)  # the least that libpq takes
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         ports = {"down": 1, "deaf": deaf.getsockname()[1]}
@@ -126,7 +126,7 @@ def test_a_server_that_is_down_or_never_answers_is_told_in_a_sentence(monkeypatc
             queue.close()
 
 
-def test_a_file_that_cannot_be_used_is_told_in_a_sentence(monkeypatch, tmp_path):
+def test_an_unusable_database_file_is_reported_in_a_sentence(monkeypatch, tmp_path):
     (tmp_path / "folder").mkdir()
     monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", f"sqlite:////{tmp_path}/folder")
     queue = JobQueue(tmp_path)
@@ -136,20 +136,20 @@ def test_a_file_that_cannot_be_used_is_told_in_a_sentence(monkeypatch, tmp_path)
         queue.all()
 
 
-def test_a_server_that_is_silent_gets_no_more_requests_until_it_answers(monkeypatch, tmp_path):
+def test_a_silent_database_gets_no_more_requests_until_it_responds(monkeypatch, tmp_path):
     """Each would keep a thread for as long as that lasts."""
-    queue, asked, answer = JobQueue(tmp_path), [], threading.Event()
+    queue, calls, release = JobQueue(tmp_path), [], threading.Event()
     assert queue.all() == []
     client = queue._client
 
     class Silent:
         def list_workflows(self, **_: object) -> list[object]:
-            asked.append(1)
-            answer.wait()
+            calls.append(1)
+            release.wait()
             return []
 
     queue._client = Silent()
-    monkeypatch.setattr(queues, "UNANSWERED_S", 0.1)
+    monkeypatch.setattr(queues, "NO_REPLY_S", 0.1)
     thread = threading.Thread(target=queue.all)
     thread.start()
     until(lambda: queue.problem is not None)
@@ -158,8 +158,8 @@ def test_a_server_that_is_silent_gets_no_more_requests_until_it_answers(monkeypa
             JobsUnavailable, match="cannot be used: a request has had no response for"
         ):
             queue.all()
-    assert asked == [1]
-    answer.set()
+    assert calls == [1]
+    release.set()
     thread.join(60)
     assert queue.problem is None
     queue._client = client
@@ -185,7 +185,7 @@ def completed(root: Path, name: str) -> CaptureStatus:
     )
 
 
-def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_path):
+def test_pending_jobs_are_enqueued_once_the_database_is_back(monkeypatch, tmp_path):
     monkeypatch.setenv("HAIRSTAGE_DATABASE_URL", "postgresql://nobody@127.0.0.1:1/nothing")
     queue = JobQueue(tmp_path)
     follower = JobFollower(tmp_path, queue, EventLog(), AuditLog(tmp_path / "audit.jsonl"))
@@ -201,8 +201,8 @@ def test_what_is_owed_is_enqueued_once_the_database_is_back(monkeypatch, tmp_pat
         until(lambda: queue.problem is None and follower.job_after("made") is None)
         # A model that is there is not made again because its job was lost with the database.
         assert queue.ids() == {job_of("fresh"), job_of("lost")}
-        told = AuditLog(tmp_path / "audit.jsonl").latest(10)
-        assert sorted((a.who, a.action, a.subject) for a in told) == [
+        entries = AuditLog(tmp_path / "audit.jsonl").latest(10)
+        assert sorted((a.who, a.action, a.subject) for a in entries) == [
             ("service", "job.submit", job_of("fresh")),
             ("service", "job.submit", job_of("lost")),
         ]

@@ -72,9 +72,7 @@ def test_unknown_pipelines_and_options_are_refused_by_name() -> None:
         PipelineRequest.model_validate({"name": "fit", "options": {"held_out": []}})
 
 
-def test_a_killed_workers_job_goes_on_at_the_step_that_was_under_way(
-    queue: JobQueue, tmp_path: Path
-) -> None:
+def test_a_killed_workers_job_resumes_at_its_current_step(queue: JobQueue, tmp_path: Path) -> None:
     job = submit(queue, tmp_path)
     log = Path(job.model) / "log.txt"
     worker = start_worker(tmp_path)
@@ -154,10 +152,10 @@ def test_a_cancelled_step_that_does_not_stop_ends_with_its_process(
 
 
 def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None:
-    now, asked = [0.0], [0]
+    now, queries = [0.0], [0]
 
     def interrupted() -> JobInterrupted | None:
-        asked[0] += 1
+        queries[0] += 1
         return JobCancelled("stop") if now[0] > 100 else None
 
     progress = StepProgress(
@@ -166,19 +164,19 @@ def test_progress_is_throttled_but_never_late_at_the_end(tmp_path: Path) -> None
     progress("early", 0.1)
     now[0] = 0.1
     progress("too soon", 0.2)
-    told = read_progress(Model(tmp_path), "job-1")
-    assert told is not None
-    assert (told.what, told.step_share, asked[0]) == ("early", 0.1, 1)
-    assert told.share == pytest.approx(0.55)
+    reported = read_progress(Model(tmp_path), "job-1")
+    assert reported is not None
+    assert (reported.what, reported.step_share, queries[0]) == ("early", 0.1, 1)
+    assert reported.share == pytest.approx(0.55)
     now[0] = 1.0
     progress("more to do than thought", 0.05)
-    told = read_progress(Model(tmp_path), "job-1")
-    assert told is not None
-    assert (told.what, told.step_share) == ("more to do than thought", 0.1)
+    reported = read_progress(Model(tmp_path), "job-1")
+    assert reported is not None
+    assert (reported.what, reported.step_share) == ("more to do than thought", 0.1)
     progress("end", 1.0)
-    told = read_progress(Model(tmp_path), "job-1")
-    assert told is not None
-    assert (told.what, told.share) == ("end", 1.0)
+    reported = read_progress(Model(tmp_path), "job-1")
+    assert reported is not None
+    assert (reported.what, reported.share) == ("end", 1.0)
     assert read_progress(Model(tmp_path), "another job") is None
     now[0] = 101.0
     with pytest.raises(JobCancelled):
@@ -196,7 +194,7 @@ def test_workers_of_one_root_have_names_of_their_own(tmp_path: Path) -> None:
         slot.release()
 
 
-def test_another_user_s_worker_is_told_by_its_heartbeat(tmp_path: Path, monkeypatch) -> None:
+def test_another_user_s_worker_is_found_by_its_heartbeat(tmp_path: Path, monkeypatch) -> None:
     slot = WorkerSlot(tmp_path)
     opened = Path.open
 

@@ -209,7 +209,7 @@ def test_priorities_retries_and_time_outs(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_renders_waits_for_a_gpu_where_the_service_says_so(tmp_path):
+def test_rendering_steps_wait_for_a_gpu_if_the_service_requires_it(tmp_path):
     queue = JobQueue(tmp_path, gpu_workers=True)
     for name in ("fit", "reconstruct"):
         queue.submit(PipelineRequest(name=name), tmp_path, Model(tmp_path / name), job=name)
@@ -258,8 +258,11 @@ def test_the_worker_of_another_machine_is_not_dead_because_its_lock_is_free(tmp_
     monkeypatch.setattr(slots, "HOST", "another")
     here.release()
     assert hold_dead(tmp_path, executor) is None
-    (seen,) = worker_statuses(tmp_path)
-    assert (seen.name, seen.alive) == ("worker-0", True)  # until it has been silent for long
+    (observed,) = worker_statuses(tmp_path)
+    assert (observed.name, observed.alive) == (
+        "worker-0",
+        True,
+    )  # until it has been silent for long
     os.utime(next(tmp_path.glob("worker-*.lock")), (0, 0))
     assert not worker_statuses(tmp_path)[0].alive
 
@@ -325,5 +328,5 @@ def test_a_server_that_goes_and_comes_back_is_a_line_each_in_a_worker_s_log(
     times = re.fullmatch(r"the job database: over after \d+ s \(it came (\d+) times\)", of_it[1])
     assert times is not None
     assert int(times[1]) >= 1
-    told = [(line["logger"], line["level"]) for line in lines if "j: " not in line["message"]]
-    assert told == [("hairstage.jobs", "ERROR"), ("hairstage.jobs", "WARNING")]
+    logged = [(line["logger"], line["level"]) for line in lines if "j: " not in line["message"]]
+    assert logged == [("hairstage.jobs", "ERROR"), ("hairstage.jobs", "WARNING")]

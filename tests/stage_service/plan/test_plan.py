@@ -133,7 +133,7 @@ class Counted(str):
     __hash__ = str.__hash__
 
 
-def test_a_disk_without_room_is_told_with_what_the_plan_needs(demo, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_with_the_space_that_the_plan_needs(demo, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=270_000_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     need = r"writes 1\.35 GB and keeps a reserve of 0\.27 GB, but .* has 0\.27 GB free: make room"
@@ -166,7 +166,7 @@ def test_values_out_of_range_are_refused(plan):
         CapturePlan(**plan)
 
 
-def test_no_projector_no_sweep_and_it_is_said(demo):
+def test_without_a_projector_the_sweep_is_skipped_and_reported(demo):
     without = replace(demo, rig=Rig("dome", demo.rig.cameras, demo.rig.lights))
     cost = resolve(CapturePlan(), without).cost
     assert "scanline" not in cost.frames_by_kind
