@@ -106,7 +106,7 @@ def test_a_dead_machine_keeps_the_stage_until_a_person_releases_it(simulated, be
     assert second.wait(capture, 60).outcome == "completed"
 
 
-def test_what_a_killed_service_has_left_is_taken(simulated, begin, tmp_path):
+def test_the_stage_of_a_killed_service_is_taken(simulated, begin, tmp_path):
     rig_file, _ = simulated()
     code = (
         "import os, sys; from pathlib import Path;"

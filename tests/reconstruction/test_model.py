@@ -126,7 +126,7 @@ def test_new_strands_leave_nothing_that_was_made_of_others(model: Model) -> None
     assert list(model.artifacts()) == kept
 
 
-def test_what_is_listed_is_whole_and_inside(model: Model, tmp_path: Path) -> None:
+def test_artifacts_exclude_partial_files_and_outside_links(model: Model, tmp_path: Path) -> None:
     model.write_strands(HAIR)
     model.write_points(PointCloud.empty(("left",), ()))
     model.write_mask("left", "hair", np.ones((2, 2), bool))

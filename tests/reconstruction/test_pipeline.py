@@ -349,7 +349,7 @@ def test_a_missing_sweep_gives_a_warning(
     assert [x.why for x in report["triangulation"].left_out] == ["no sweep was captured"]
 
 
-def test_what_cannot_be_done_without_is_named(
+def test_missing_inputs_raise_errors_that_name_them(
     shoot: Callable[..., Capture], around: list[Camera], unswept: Capture, tmp_path: Path
 ) -> None:
     bare = shoot(cameras=around[:2], projectors=[])

@@ -28,7 +28,7 @@ def test_the_old_name_of_a_field_is_read() -> None:
     assert made.refine.marginal_coverage == 0.1
 
 
-def test_what_is_given_by_position_is_named_by_its_field() -> None:
+def test_errors_of_positional_options_name_their_field() -> None:
     assert LogGaborBank(4.0, 12) == LogGaborBank(wavelength=4.0, count=12)
     with pytest.raises(ValidationError) as caught:
         LogGaborBank(4.0, 1)

@@ -293,7 +293,7 @@ def test_options_that_no_fit_could_have_are_refused_before_it(wrong):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_what_each_view_has_for_itself_is_no_field(planted, seed):
+def test_factors_of_single_views_give_doubts(planted, seed):
     """Fitted to some views it is wrong in others, whose factors were drawn on their own."""
     options = replace(ROUGH, ridges=(1e-2, 0.1, 1.0), folds=3)
     found = fitted(planted, per_view(planted, seed), options)

@@ -83,9 +83,7 @@ def test_an_interrupted_fit_does_not_begin_again(
 
 
 @pytest.mark.slow
-def test_what_comes_again_and_spoils_what_was_found_is_not_taken(
-    plain, tufted, original, monkeypatch
-):
+def test_a_repeated_step_that_worsens_the_fit_is_rejected(plain, tufted, original, monkeypatch):
     options = replace(original, variant="spatial", shape=(2, 2, 2))
     right, calls = loop.absorption_of_cells, []
 

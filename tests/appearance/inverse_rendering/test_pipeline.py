@@ -245,7 +245,7 @@ def test_a_parameter_that_images_do_not_determine_is_warned_of(made, tmp_path, m
     assert reported.startswith("beta_n is undetermined")
 
 
-def test_what_does_not_fit_into_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
+def test_a_fit_beyond_free_memory_is_refused_before_it_starts(made, tmp_path, monkeypatch):
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)

@@ -22,7 +22,7 @@ def test_dark_hair_needs_few_bounces_and_white_hair_many(small):
     assert all(0 <= x.left_out <= x.bound <= 2e-3 for x in limits)
 
 
-def test_what_is_left_out_is_what_was_said(small):
+def test_the_bounce_limit_omits_the_predicted_light(small):
     """Over lights all around, the same paths with and without the limit."""
     scene, camera = build_scene(small.tuft(), None, hair=BLOND), small.camera()
     lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(64, 3.0))]

@@ -185,7 +185,7 @@ def test_colour_of_rendered_hair_is_recovered(wisp):
 
 
 @pytest.mark.slow
-def test_what_strands_lack_does_not_lighten_the_hair(wisp):
+def test_pixels_without_strands_do_not_lighten_the_hair(wisp):
     """A third of the pixels shows hair like the rest, where there is no strand."""
     strands, camera, lights = wisp
     truth = HairAppearance((0.1, 0.3, 0.9), 0.3, 0.2)

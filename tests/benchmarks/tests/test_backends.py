@@ -26,7 +26,7 @@ def found(*values: float) -> Done:
     return Done(1.0, 1.0, np.array(values, np.float32), {})
 
 
-def test_what_both_have_is_compared_and_what_one_lacks_is_counted() -> None:
+def test_common_values_are_compared_and_missing_ones_are_counted() -> None:
     nan = float("nan")
     said = compared(found(1.0, 2.0, nan, 4.0, nan), found(1.0, 2.0001, 3.0, nan, nan))
     assert said["only_one"] == pytest.approx(2 / 4)

@@ -75,7 +75,7 @@ def test_levels_hold_for_every_lamp(bench, kind):
             one.driver.set_level(level)
 
 
-def test_what_it_cannot_is_an_error_and_a_flag(any_bank):
+def test_missing_capabilities_raise_errors_and_have_flags(any_bank):
     driver = any_bank.driver
     can = driver.capabilities
     if can.reads_back:

@@ -101,7 +101,7 @@ class Glaring(Capture):
 
 
 @pytest.mark.slow
-def test_what_shines_beside_a_mirror_is_warned_of(
+def test_a_highlight_beside_the_mirror_gives_a_warning(
     nominal_rig: Rig, board_captures: list[Capture], mirror_captures: list[Capture]
 ) -> None:
     """Without it the highlights are met to under half a pixel."""
@@ -158,12 +158,12 @@ def test_device_missing_from_the_truth_is_reported_before_the_work(
         ({"diffuse_radius": float("inf")}, "diffuse sphere: expected a radius"),
     ],
 )
-def test_what_no_target_can_be_is_refused(wrong: dict[str, float], said: str) -> None:
+def test_impossible_target_sizes_are_refused(wrong: dict[str, float], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         Targets(**wrong)  # type: ignore[arg-type]
 
 
-def test_what_no_capture_shows_stays_nominal_and_is_listed(
+def test_devices_in_no_capture_stay_nominal_and_are_listed(
     nominal_rig: Rig, board_captures: list[Capture]
 ) -> None:
     rig, report = calibrate(

@@ -74,7 +74,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "c"
 
 
-def test_what_is_written_reads_back_exactly(path):
+def test_a_written_capture_reads_back_exactly(path):
     capture = Capture(path)
     assert verify(path) == []
     assert capture.steps == STEPS
@@ -182,7 +182,7 @@ def test_lost_and_unreadable_files_are_named(path):
     assert any(p.startswith("journal.jsonl does not match") for p in problems)
 
 
-def test_what_is_no_capture_is_one_sentence(tmp_path):
+def test_verify_of_another_folder_gives_one_sentence(tmp_path):
     (problem,) = verify(tmp_path)
     assert "is not a capture: expected rig.json and plan.json" in problem
 
@@ -326,9 +326,7 @@ def test_stored_frames_count_only_once_they_are_committed(tmp_path):
 
 
 @pytest.mark.parametrize("direct", [True, False], ids=["past the cache", "through the cache"])
-def test_what_is_journalled_was_flushed_before_however_many_frames_share_a_flush(
-    tmp_path, monkeypatch, direct
-):
+def test_frames_are_flushed_before_their_journal_lines(tmp_path, monkeypatch, direct):
     """One flush of the whole disk for six files, or one a file where pages may be in a cache."""
     writer = CaptureWriter.create(tmp_path / "c", RIG, {"steps": STEPS})
     wrote: Any = durable.write_pages

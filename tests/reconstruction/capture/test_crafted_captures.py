@@ -119,7 +119,7 @@ def test_names_that_do_not(tmp_path, name):
         inside(tmp_path, name)
 
 
-def test_what_is_no_plain_file_is_not_opened(tmp_path):
+def test_pipes_devices_and_folders_are_not_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.obj")
     for path in (tmp_path / "pipe.obj", Path("/dev/zero"), tmp_path):
         with pytest.raises(NotContained, match="no plain file"):

@@ -193,7 +193,7 @@ def test_wrong_pictures(folder: Path, tmp_path: Path) -> None:
         import_folder(folder, tmp_path / "out")
 
 
-def test_what_does_not_count_in_metres_is_named(folder: Path, tmp_path: Path) -> None:
+def test_files_in_other_units_than_metres_are_named(folder: Path, tmp_path: Path) -> None:
     """Files of our own layout have no unit that an option could give."""
 
     def refused(words: str) -> None:

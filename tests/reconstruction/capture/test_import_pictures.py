@@ -202,7 +202,7 @@ HALF_TURN = np.frombuffer(
 """EXIF whose orientation is 3: a viewer shows the picture upside down."""
 
 
-def test_what_viewers_turn_is_read_as_it_is_stored(folder, tmp_path):
+def test_exif_rotation_is_ignored(folder, tmp_path):
     """EXIF turned AVIF and masks by a half, and left PNG, TIFF and JPEG as they were."""
     stored = np.zeros((SIZE, SIZE, 3), np.uint8)
     stored[4:10, 2:8] = 255

@@ -192,7 +192,7 @@ def test_true_directions_are_the_mean_over_a_cube() -> None:
         assert tangent[there, axis] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_what_lies_a_world_away_keeps_its_direction() -> None:
+def test_distant_strands_keep_their_direction() -> None:
     true = Strands.from_list([np.array([[0.002, 0.002, 0.002], [0.002, 0.002, 0.1]])])
     at = np.array([[0.001, 0.001, 0.05], [1e5, 1e5, 1e5]])
     ours = Strands.from_list([np.array([p, p + np.array([0.02, 0, 0])]) for p in at])

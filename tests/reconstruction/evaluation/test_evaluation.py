@@ -221,7 +221,7 @@ def test_strands_in_another_unit_are_refused_before_they_fill_the_memory(front: 
         Visibility([front], spoilt)
 
 
-def test_what_hangs_behind_strands_is_hidden(front: Camera) -> None:
+def test_points_behind_strands_are_hidden(front: Camera) -> None:
     dense = curtain(spacing=2.5e-4)
     visible = Visibility([front], dense)
     inner = dense.subset(np.arange(40, len(dense) - 40)).resampled(1e-3).points

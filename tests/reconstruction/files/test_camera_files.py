@@ -141,7 +141,7 @@ def test_cameras_not_aligned_by_metashape_give_a_warning(tmp_path: Path) -> None
     assert isinstance(read_cameras(path).cameras[0], LensModelCamera)
 
 
-def test_what_opencv_did_not_write_is_refused(tmp_path: Path) -> None:
+def test_files_not_written_by_opencv_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "cam.yml"
     for text, words in (
         ("not: [yaml", "OpenCV cannot read it"),

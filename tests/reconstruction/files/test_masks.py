@@ -59,7 +59,7 @@ def test_a_file_that_unpacks_to_more_than_its_pixels_is_refused():
     assert not decode_mask(bombs.png(640, 480, more=many), 640, 480).any()
 
 
-def test_what_a_file_says_of_its_sizes_is_not_believed(png, monkeypatch):
+def test_wrong_sizes_in_a_mask_file_are_refused(png, monkeypatch):
     with pytest.raises(ValueError, match="expected a PNG of 2x3 pixels, got 3x2"):
         decode_mask(png, 2, 3)
     with pytest.raises(ValueError, match="another file"):

@@ -105,7 +105,9 @@ def npy(shape: tuple[int, int]) -> bytes:
         ("a.npy", npy((450_000_000, 3)), "needs 10800000000 bytes, the file has"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+def test_invalid_point_files_raise_errors_that_name_the_problem(
+    tmp_path: Path, name: str, content: bytes, words: str
+) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=words):
         read_points(tmp_path / name)

@@ -54,7 +54,7 @@ def test_rays_and_projection_are_inverse_wherever_the_lens_is_accepted(k):
     np.testing.assert_allclose(there, pixels, atol=1e-6)
 
 
-def test_what_is_far_outside_stays_outside():
+def test_points_far_outside_the_image_stay_outside():
     one = camera()
     angle = np.linspace(0, 2 * np.pi, 60)[:, None]
     for radius in (1.0, 2.0, 4.0, 50.0):

@@ -182,7 +182,7 @@ def test_a_strand_over_the_scalp_rises_from_under_it_and_runs_as_its_neighbour_d
         assert strand[:, 2].max() < 0.022
 
 
-def test_what_has_no_neighbour_rises_to_its_lower_end_or_is_dropped_out_of_reach() -> None:
+def test_strands_without_neighbours_are_extended_to_the_scalp_or_dropped() -> None:
     loose = [line((0, 0, 0.035), (0.01, 0, 0.015)), line((0, 0, 0.05), (0.01, 0, 0.045))]
     result = root_all([], loose, flat_scalp())
     assert (result.to_scalp, result.joined, result.dropped) == (1, 0, 1)

@@ -127,7 +127,7 @@ def test_copies_and_strands_across_the_measured_ones_go() -> None:
     assert figures["removed"] == len(given) - len(made)
 
 
-def test_what_lies_far_from_every_line_hardly_moves() -> None:
+def test_points_far_from_every_line_hardly_move() -> None:
     start = strands(1, 5e-4)
     made, _ = refine(
         start, lines(0.0, 0.0, below=40e-3), RefineOptions(steps=3, marginal_coverage=0)
@@ -146,7 +146,7 @@ def test_what_lies_far_from_every_line_hardly_moves() -> None:
         (8e-3, -8e-3),  # nothing of that surface
     ],
 )
-def test_what_is_guessed_is_not_where_cameras_would_see_it(before: float, expected: float) -> None:
+def test_unmeasured_points_stay_hidden_from_cameras(before: float, expected: float) -> None:
     """A wall 0.5 m before a camera that looks along y; lines are measured on its left half.
 
     What moves comes to the mean of 1 mm behind it (± 1 mm) and of where it was (± 3 mm).

@@ -61,7 +61,7 @@ def test_the_threshold_is_the_median_under_the_furthest_light_or_three_sigma() -
     assert code_map(responses, mask, 1, noise=0.15).threshold == pytest.approx(0.45)
 
 
-def test_what_a_light_brings_little_of_is_reached_though_it_counts_as_shadow() -> None:
+def test_dimly_lit_pixels_are_reached_though_they_count_as_shadow() -> None:
     mask = np.ones((1, 40), bool)
     bright, dim = np.ones((1, 40)), np.full((1, 40), 0.02)
     dim[0, :2] = 1e-4  # behind something

@@ -92,7 +92,7 @@ def test_fibres_are_found_in_views_that_are_all_saturated(fibres: Any, tmp_path:
     assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.8
 
 
-def test_what_cannot_be_done_without_is_named(fibres: Any, tmp_path: Path) -> None:
+def test_missing_inputs_raise_errors_that_name_them(fibres: Any, tmp_path: Path) -> None:
     dark = fibres.shoot(tmp_path / "dark", brightness=0.0)
     with pytest.raises(CaptureError, match=r"no hair pixel has a direction|no segment of"):
         run(dark, tmp_path / "m")

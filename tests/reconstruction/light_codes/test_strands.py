@@ -45,7 +45,7 @@ def test_smoothing_keeps_the_ends_and_takes_the_jitter() -> None:
 
 
 @pytest.mark.parametrize("length", [1e-12, 1e-6, 1e-3])
-def test_what_is_far_shorter_than_the_gaussian_becomes_its_chord(length: float) -> None:
+def test_lines_far_shorter_than_the_gaussian_become_their_chords(length: float) -> None:
     s = np.linspace(0, 1, 9)
     bow = length * np.stack([s, np.sin(np.pi * s), 0 * s], axis=1)
     (found,) = smoothed([bow], 0.01)

@@ -163,7 +163,7 @@ def test_isolated_points_are_outliers() -> None:
     assert not supported(points[:5], np.ones(5), 8, 4.0).any()
 
 
-def test_what_a_coarse_camera_alone_sees_is_no_outlier_beside_a_fine_one(
+def test_points_of_a_coarse_camera_alone_are_kept_beside_a_fine_camera(
     shoot: Shoot, stage_camera: Callable[..., Camera], stage_projector: Callable[..., Projector]
 ) -> None:
     """A third as many pixels a side see the ball's back; alone they keep 0.88 of their points."""

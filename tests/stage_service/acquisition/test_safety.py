@@ -99,14 +99,14 @@ def test_dark_by_a_contradicted_read_back_is_reported_as_such():
         ((False, True, True), "the interlock is open, the emergency stop is pressed"),
     ],
 )
-def test_what_else_puts_the_lamps_off_is_named_in_the_detail(causes, named):
+def test_other_causes_of_dark_lamps_are_named_in_the_detail(causes, named):
     result = blackout(stage(Stopped(*causes), Beams()))
     dark = "every lamp and projector was read back dark"
     assert (result.state, result.detail) == ("dark", f"{dark}; lights reported then: {named}")
     assert blackout(stage(Stopped(False, False, False), Beams())).detail == dark
 
 
-def test_what_cannot_be_read_back_is_unknown_and_blocks_unless_that_is_accepted():
+def test_lamps_without_read_back_are_unknown_and_block_unless_accepted():
     unread = blackout(stage(Silent(), Beams()), attempts=1)
     assert (unread.state, unread.blocks) == ("unknown, unsafe", True)
     accepted = blackout(stage(Silent(), Beams(), accepts=True), attempts=1)

@@ -278,7 +278,7 @@ def test_frames_are_those_of_the_capture(http, tmp_path):
     assert http.get(f"/captures/{done['id']}/frames/0/cam_1.exr").status_code == 200
 
 
-def test_what_a_page_shows_of_a_capture(http, rig_file):
+def test_frames_of_a_capture_have_figures_and_previews(http, rig_file):
     done = capture_done(http, {"plan": SHORT})
     frames = f"/captures/{done['id']}/frames"
     steps = http.get(f"/captures/{done['id']}/steps").json()
@@ -482,7 +482,7 @@ def test_every_route_is_documented(http):
         ('{"plan": {"rows": {"step": 1' + "0" * 400 + "}}}", "rows"),
     ],
 )
-def test_what_json_cannot_mean_is_refused_before_anything_is_lit(http, world, body, why):
+def test_invalid_json_is_refused_before_a_lamp_is_lit(http, world, body, why):
     refused = http.post("/captures", content=body, headers={"content-type": "application/json"})
     (error,) = problem(refused, "invalid-request")["errors"]
     assert why in error["msg"] or why in error["loc"]

@@ -77,7 +77,7 @@ def ended(connection: socket.socket) -> bool:
 
 
 @pytest.mark.parametrize("data", [b"", HALF, SLOW])
-def test_whoever_holds_connections_open_keeps_nobody_out(connect, data):
+def test_idle_connections_keep_no_client_out(connect, data):
     held = [connect(data) for _ in range(9)]
     assert connect(REQUEST).recv(12) == b"HTTP/1.1 200"
     assert all(ended(one) for one in held[:6])

@@ -152,7 +152,7 @@ def test_a_model_that_is_a_link_does_not_keep_the_trash_from_being_emptied(http,
     assert (outside / "passwd").read_bytes() == SECRET
 
 
-def test_what_cannot_be_deleted_is_named_and_the_younger_goes(http, monkeypatch):
+def test_undeletable_trash_is_named_and_younger_trash_is_deleted(http, monkeypatch):
     for name in ("old", "young"):
         Model(http.service.root / "models" / name).create()
         http.delete(f"/models/{name}").raise_for_status()

@@ -220,7 +220,7 @@ class Slow(PosixPath):
         return super().stat(follow_symlinks=follow_symlinks)
 
 
-def test_nobody_waits_for_a_disk_that_does_not_say_whose_a_token_is(rig_file, world, tmp_path):
+def test_no_request_waits_for_a_hanging_token_file(rig_file, world, tmp_path):
     """One request with a token of the file must not keep another from a blackout."""
     Slow.there.set()
     tokens = Tokens(Slow(tmp_path / "tokens.json"), own="mine")

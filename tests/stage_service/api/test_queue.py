@@ -223,7 +223,7 @@ def test_nothing_begins_after_a_service_that_was_ended_in_a_capture(rig_file, tm
         ended(http, 2)
 
 
-def test_what_is_being_shot_is_known_to_the_next_service(http, world):
+def test_the_running_capture_is_recorded_for_the_next_service(http, world):
     world.busy = {"cam_1": 10**9}
     capture = http.post("/captures", json=plan(1)).json()["id"]
     assert (http.service.root / "shooting").read_text() == f"{capture}\n"
@@ -231,7 +231,7 @@ def test_what_is_being_shot_is_known_to_the_next_service(http, world):
     until(lambda: not (http.service.root / "shooting").exists())
 
 
-def test_what_can_not_begin_any_more_holds_the_queue_and_says_why(http, world, tmp_path):
+def test_an_entry_that_cannot_start_holds_the_queue_with_the_reason(http, world, tmp_path):
     head = tmp_path / "head.obj"
     assert slug(http.post("/queue", json={"head": str(head)})) == "bad-input"
     head.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\ng scalp\nf 1 2 3\n")

@@ -136,7 +136,7 @@ def test_a_flood_of_refusals_is_a_few_lines_and_a_count(app, service, tokens):
     assert last.detail.startswith("forbidden: 295 more ")
 
 
-def test_what_was_only_counted_is_recorded_soon_after(tmp_path, monkeypatch):
+def test_counted_refusals_are_recorded_soon_after(tmp_path, monkeypatch):
     monkeypatch.setattr(refusals, "EVERY_S", 0.05)
     audit = AuditLog(tmp_path / "audit.jsonl")
     counted = Refusals(audit)

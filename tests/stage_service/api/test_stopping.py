@@ -65,7 +65,7 @@ def test_blackout_and_health_respond_while_the_service_stops(
     assert not thread.is_alive()
 
 
-def test_what_does_not_end_is_named_and_the_others_are_closed(rig_file, tmp_path, monkeypatch):
+def test_parts_that_do_not_stop_are_named_and_others_are_closed(rig_file, tmp_path, monkeypatch):
     service, stuck = Service(rig_file, tmp_path / "root"), threading.Event()
     monkeypatch.setattr(service.calibrating, "close", stuck.wait)
     monkeypatch.setattr(services, "OTHERS_S", 0.1)

@@ -82,7 +82,7 @@ def test_files_have_tags_and_ranges_and_head_is_get_without_its_body(http):
     assert time.monotonic() - begin < 10, "an endless stream would run into the time-out"
 
 
-def test_what_is_removed_is_in_the_trash_and_comes_back(http):
+def test_a_removed_capture_is_in_the_trash_and_can_be_restored(http):
     capture = shot(http)
     name, path = capture["id"], Path(capture["path"])
     before = {p.name: p.stat().st_size for p in path.rglob("*") if p.is_file()}
@@ -118,7 +118,7 @@ def _files(path: Path) -> list[Path]:
     return [p for p in path.rglob("*") if p.is_file()]
 
 
-def test_what_is_in_use_stays(http, world):
+def test_captures_and_models_in_use_cannot_be_removed(http, world):
     world.busy = {"cam_1": 10**9}
     running = http.post("/captures", json={"plan": SHORT}).json()["id"]
     for method in (http.delete, http.get):
@@ -183,7 +183,7 @@ def test_a_key_belongs_to_one_caller_and_one_request(rig_file, world, tmp_path):
         assert hers.json()["id"] != first
 
 
-def test_who_may_remove(rig_file, world, tmp_path):
+def test_removal_needs_its_scopes(rig_file, world, tmp_path):
     tokens = Tokens(tmp_path / "tokens.json", "own")
     steers = {"Authorization": f"Bearer {tokens.make('eve', ('read', 'steer'))}"}
     with serving(rig_file, tmp_path / "root", Access(tokens)) as http:
@@ -298,7 +298,7 @@ def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
     assert responses == 20 * [200]
 
 
-def test_what_is_deleted_twice_at_once_is_deleted_once(http):
+def test_concurrent_deletions_delete_once(http):
     root = http.service.root
     removed = {"kind": "capture", "by": "eve", "removed": "2026-01-01T00:00:00.000+00:00"}
     responses: list[int] = []
@@ -328,7 +328,7 @@ def test_what_is_deleted_twice_at_once_is_deleted_once(http):
     assert http.get("/trash").json() == http.get("/uploads").json() == []
 
 
-def test_what_a_kill_left_of_the_trash_is_listed_until_it_has_gone(http, monkeypatch):
+def test_interrupted_deletions_are_listed_until_completed(http, monkeypatch):
     capture = shot(http)
     removed = http.delete(f"/captures/{capture['id']}").json()
     place = Path(capture["path"]).parents[1] / "trash" / removed["name"]

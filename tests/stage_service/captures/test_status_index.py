@@ -62,7 +62,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_what_has_not_changed_is_not_read_again(folders, read, tmp_path):
+def test_unchanged_captures_are_not_read_again(folders, read, tmp_path):
     index = tmp_path / "index"
     expected = {f.name: read_status(f) for f in folders}
     assert read_statuses(folders, index) == expected
@@ -95,7 +95,7 @@ def test_an_index_that_cannot_be_read_is_made_anew(folders, text, tmp_path):
     assert len(index.read_text().splitlines()) == 2
 
 
-def test_what_it_says_of_a_file_that_changed_is_not_believed(folders, read, tmp_path):
+def test_the_index_is_ignored_for_changed_files(folders, read, tmp_path):
     """Cut by a byte, with the time of before."""
     index, journal = tmp_path / "index", folders[1] / "journal.jsonl"
     read_statuses(folders, index)

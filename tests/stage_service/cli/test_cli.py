@@ -89,7 +89,7 @@ def test_help_is_fast_because_nothing_heavy_is_imported():
     assert done.stdout.strip() == "[]"
 
 
-def test_what_libraries_print_is_no_part_of_a_result(capsys):
+def test_output_of_libraries_is_no_part_of_a_result(capsys):
     def noisy(args, output):
         print("Warning: a binding's own")
         output.result({"found": 1})
@@ -359,9 +359,7 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
         ("calibrate board {tmp}/b.png --dpi inf", "--dpi inf: "),
     ],
 )
-def test_what_is_wrong_is_one_sentence_that_names_it_before_any_work(
-    capsys, tmp_path, command, said
-):
+def test_invalid_input_is_named_in_one_sentence_before_any_work(capsys, tmp_path, command, said):
     (tmp_path / "list.json").write_text("[1]")
     (tmp_path / "bytes").write_bytes(b"\xff\xfe")
     code, data = run(capsys, *shlex.split(command.format(tmp=tmp_path)))

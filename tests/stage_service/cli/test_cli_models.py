@@ -295,7 +295,7 @@ def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
         (("--capture", "{capture}", "--camera", "c0", "--size", "64"), "--size and --camera"),
     ],
 )
-def test_what_a_render_would_leave_out_is_refused(made, capsys, words, said):
+def test_render_options_without_effect_are_refused(made, capsys, words, said):
     arguments = [str(made.model), *(w.format(capture=made.capture) for w in words)]
     code, found = run(capsys, "render", *arguments)
     assert code == 3

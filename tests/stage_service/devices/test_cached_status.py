@@ -7,7 +7,7 @@ import threading
 from stage_service.devices.cached_status import CachedStatus
 
 
-def test_who_found_no_thread_to_look_with_looks_the_next_time(monkeypatch):
+def test_status_is_queried_again_after_no_thread_could_start(monkeypatch):
     def none_left(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 

@@ -204,7 +204,7 @@ FRAME = {"block_id": 1, "timestamp": 2.5, "exposure": 0.02, "left": 0, "bytes": 
 @pytest.mark.parametrize(
     ("hello", "field"), [*((True, f) for f in HELLO), *((False, f) for f in FRAME)]
 )
-def test_what_is_no_number_is_an_error_that_names_the_camera(rig_file, hello, field, value):
+def test_a_non_numeric_reply_raises_an_error_that_names_the_camera(rig_file, hello, field, value):
     replies = [HELLO | {field: value}, {}] if hello else [HELLO, {}, FRAME | {field: value}]
 
     def peer() -> None:

@@ -78,7 +78,7 @@ def test_a_blackout_waits_for_the_command_under_way_but_not_for_one_that_hangs()
     thread.join()
 
 
-def test_who_stood_still_is_found_by_the_watch_and_by_who_lights_next():
+def test_a_standstill_is_found_by_the_watch_and_by_the_next_lighting():
     """The second is the first to run again, as after a machine's sleep."""
     clock, found = Boot(), list[str]()
     still = Standstill(1e6, found.append, clock)  # its own thread looks in 70 hours

@@ -191,7 +191,7 @@ def test_a_broken_greeting_is_reported_and_nothing_is_switched(
     assert projector.power() is Power.STANDBY
 
 
-def test_nobody_there_is_unreachable() -> None:
+def test_a_missing_projector_is_unreachable() -> None:
     with socket.create_server(("127.0.0.1", 0)) as gone:
         port = int(gone.getsockname()[1])
     with pytest.raises(DeviceUnreachable, match="PJLink is enabled"):

@@ -110,7 +110,7 @@ def test_exposure_and_level_are_the_plan_s_then_the_rig_file_s(demo):
         ({"lights": (), "projectors": (), "sentinels": False}, "the plan has no steps"),
     ],
 )
-def test_what_the_rig_cannot_do_is_refused_before_anything_lights(demo, plan, problem):
+def test_plans_beyond_the_rig_are_refused(demo, plan, problem):
     with pytest.raises(PlanError) as error:
         resolve(CapturePlan(**plan), demo)
     assert problem in str(error.value)

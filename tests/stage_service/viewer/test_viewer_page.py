@@ -280,5 +280,5 @@ SHADE_25 = """async () => {
         shaded = [0, 24];
         await relight.shade({});
     } catch (e) { error = e.message; }
-    return { error, latest: [...relight.cache.keys()].slice(-3), size: relight.kept.size };
+    return { error, latest: [...relight.cache.keys()].slice(-3), size: relight.cache.size };
 }"""

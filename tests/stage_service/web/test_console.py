@@ -133,7 +133,7 @@ def test_a_slow_step_shows_how_many_cameras_have_responded(console, monkeypatch)
     says(page, "Dark, verified")
 
 
-def test_what_is_no_number_is_refused_not_left_out(console):
+def test_invalid_numbers_in_fields_are_refused(console):
     http, pages = console()
     page = pages.open("plan")
     page.wait_for_selector("button:text-is('Start now'):enabled")
@@ -151,7 +151,7 @@ def test_what_is_no_number_is_refused_not_left_out(console):
     pages.complaints.clear()
 
 
-def test_what_was_shot_for_a_calibration_is_kept_whatever_view_is_open(console, monkeypatch):
+def test_calibration_captures_are_kept_while_another_view_is_open(console, monkeypatch):
     make, go_on = FrameMaker.counts, Event()
 
     def slow(self, camera, shot, exposure):
@@ -304,7 +304,7 @@ def test_after_a_frame_that_is_missing_the_camera_shows_the_next_ones(console):
     until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
 
 
-def test_what_was_shot_at_last_is_missing_no_more(console):
+def test_repeated_frames_are_no_longer_listed_as_missing(console):
     http, pages = console(Fault("camera", "drop", 4, "cam_b"))
     page = pages.open()
     http.post("/captures", json={"plan": {**PACED, "retries": 0}}).raise_for_status()
@@ -388,7 +388,7 @@ def test_a_bank_that_dies_in_a_pause_is_reported_and_resumes_after_repair(
     assert pages.complaints == []
 
 
-def test_what_is_removed_elsewhere_is_shown_no_more(console):
+def test_a_capture_removed_elsewhere_disappears_from_the_page(console):
     http, pages = console()
     ids = []
     for _ in range(2):
