@@ -251,7 +251,7 @@ def test_late_dmx_reply_is_not_matched_to_the_next_request(bench, widget, monkey
     for lamp in range(8, 50):
         one.driver.select(lamp)
         assert one.lit() == [lamp]
-    assert one.seen.count("3") == 46  # one of them when it connected
+    assert one.requests.count("3") == 46  # one of them when it connected
 
 
 def test_noise_before_a_widgets_reply_is_skipped(bench):
