@@ -103,7 +103,7 @@ export function open(view) {
       ["Capture", h("a", { href: `#frames/${encodeURIComponent(c.id)}` }, c.id)],
       ["Steps", `${number(c.step)} of ${number(c.steps)}`],
       ["Frames", `${number(frames)} of ${number(c.frames_planned)}`],
-      busy() ? ["Time left", silence() ? "not known" : p?.seconds_left == null ? `not known yet (predicted ${seconds(c.seconds_predicted)} in all)` : timeLeft(c)] : ["Took", `${seconds(c.seconds)} (predicted ${seconds(c.seconds_predicted)})`],
+      busy() ? ["Time left", silence() ? "not known" : p?.seconds_left == null ? `not known yet (predicted ${seconds(c.seconds_predicted)} in all)` : timeLeft(c)] : ["Duration", `${seconds(c.seconds)} (predicted ${seconds(c.seconds_predicted)})`],
       ["Shot again", number(p?.again ?? S.missing.filter((x) => x.shot_again).length)],
       ["Missing", h(c.frames_missing ? "b.bad" : "span", number(c.frames_missing))],
       ["Then", c.job ? h("a", { href: `#jobs/${c.job}` }, c.request.pipeline?.name ?? c.job) : c.request.pipeline?.name ?? "nothing follows"],
@@ -130,7 +130,7 @@ export function open(view) {
       return;
     }
     headlineOfLamps();
-    const last = busy() ? `${HEADLINES[c.state].toLowerCase()}, step ${number(c.step)} of ${number(c.steps)}.` : `Capture ${c.id} ${HOW[c.outcome]}${c.started ? `, begun ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`;
+    const last = busy() ? `${HEADLINES[c.state].toLowerCase()}, step ${number(c.step)} of ${number(c.steps)}.` : `Capture ${c.id} ${HOW[c.outcome]}${c.started ? `, started ${clock(c.started)}` : ""}.${c.error && !S.failed ? ` ${c.error}` : ""}`;
     setContent(status, silent ? `Last known at ${silent.clock}: ${last}` : last);
   }
 
