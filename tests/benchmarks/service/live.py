@@ -98,13 +98,13 @@ class Live:
         self.child.terminate()
         self.child.wait(HURRY_S)
 
-    def call(self, method: str, path: str, body: Any = None) -> Any:
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
         """The answer's JSON. Raises where it is none of success."""
         return self.http.request(method, path, json=body).raise_for_status().json()
 
     def until_done(self, capture: str) -> dict[str, Any]:
         """The capture once it is done."""
-        while (status := self.call("GET", f"/captures/{capture}"))["state"] != "done":
+        while (status := self.ask("GET", f"/captures/{capture}"))["state"] != "done":
             time.sleep(0.1)
         done: dict[str, Any] = status
         return done
