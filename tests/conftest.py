@@ -29,15 +29,26 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-FIRST = ("system", "faults", "contracts", "appearance", "benchmarks")
-"""Folders that begin first: what mostly waits, beside it what mostly computes and takes longest."""
+FIRST = (
+    "system",
+    "faults",
+    "stage_service/web",
+    "test_examples.py",
+    "contracts",
+    "appearance",
+    "benchmarks",
+)
+"""What begins first: the longest files, what mostly waits, beside it what mostly computes."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """`FIRST` in front; with `--no-loadscope-reorder` xdist keeps that order."""
-    place = {name: i for i, name in enumerate(FIRST)}
-    tests = CHECKOUT / "tests"
-    items.sort(key=lambda item: place.get(item.path.relative_to(tests).parts[0], len(FIRST)))
+
+    def place(item: pytest.Item) -> int:
+        path = item.nodeid.removeprefix("tests/")
+        return next((i for i, name in enumerate(FIRST) if path.startswith(name)), len(FIRST))
+
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="session", autouse=True)

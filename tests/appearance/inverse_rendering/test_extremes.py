@@ -57,8 +57,8 @@ def test_a_roughness_that_starts_at_either_end(plain, tufted, beta_m):
 
 
 def test_one_light_and_one_view(tufted):
-    lone = tufted.problem(views=1, lights=tufted.dome(8)[:1], spp=1024)
-    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=256))
+    lone = tufted.problem(views=1, lights=tufted.dome(8)[:1], spp=256)
+    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
     found = check(lone, HairMaps.of(START), quiet)
     assert (np.diff(found.sigma_a[0, 0, 0]) > 0).all(), "brown hair takes most of the blue"
 

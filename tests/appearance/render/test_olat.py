@@ -206,7 +206,7 @@ def test_pixels_of_a_rendering_have_independent_noise(tufted, spp):
     """Differences of two runs are noise: that of a pixel and of its copy do not go together."""
     scene, camera, lights = tufted
     twice = np.tile(covered_pixels(scene, camera), 2)
-    runs = [render_olat(scene, camera, lights, spp=spp, seed=s, pixels=twice) for s in range(64)]
+    runs = [render_olat(scene, camera, lights, spp=spp, seed=s, pixels=twice) for s in range(32)]
     noise = np.sqrt(np.stack(runs[::2])) - np.sqrt(np.stack(runs[1::2]))
     one, other = np.split(noise[..., 0], 2, axis=2)
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.03

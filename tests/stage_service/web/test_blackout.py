@@ -143,6 +143,17 @@ def stage(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[Ca
             desk.kill()
 
 
+@pytest.fixture(params=["", pytest.param("filmed", marks=pytest.mark.slow)])
+def film(request, film):
+    """Takes no pictures in the fast tests, but where a test is filmed in any case."""
+    if not request.param and "HAIRSTAGE_FILM" not in os.environ:
+        film.take = lambda *_, **__: None
+    return film
+
+
+filmed = pytest.mark.parametrize("film", ["filmed"], indirect=True)
+
+
 @pytest.fixture
 def desk(stage: Callable[..., Desk]) -> Iterator[Desk]:
     yield stage()
@@ -246,6 +257,7 @@ def test_blackout_while_the_service_responds(press, state, desk, film):
     assert film.wrong == [], "\n".join(film.wrong)
 
 
+@filmed
 def test_a_page_that_was_never_logged_in_shows_that_it_cannot_darken(desk, film):
     page = desk.pages().open()
     page.wait_for_selector(".alarm:has-text('This page cannot darken the stage.')")
@@ -262,6 +274,7 @@ def test_a_page_that_was_never_logged_in_shows_that_it_cannot_darken(desk, film)
     assert film.wrong == [], "\n".join(film.wrong)
 
 
+@filmed
 def test_a_lamp_that_stays_lit_is_named_when_blackout_is_pressed(stage, film):
     desk = stage(Fault("lights", "stuck", 5))
     page = desk.page()
