@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from reconstruction.arrays import Array
 from reconstruction.geometry.cameras import Pinhole
@@ -44,6 +43,8 @@ class Projector(Pinhole):
 
     def row_weight(self, row: ArrayLike, v: ArrayLike) -> Array:
         """Share `(...)` of the all-on light that reaches row `v` when `row` alone is lit."""
+        from scipy.special import ndtr  # slow to load, and rigs alone do not need it
+
         offset = np.asarray(row, float) - np.asarray(v, float)
         above, below = ((offset + s) / self.line_sigma for s in (0.5, -0.5))
         return np.asarray(ndtr(above) - ndtr(below))

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from reconstruction import Capture, Mesh, Model, Strands
 from reconstruction.arrays import Floats
@@ -120,6 +119,8 @@ class Viewed:
 
     @cached_property
     def _confidence(self) -> bytes:
+        from scipy.spatial import cKDTree  # slow to load, and not needed to start a service
+
         if not self.model.has("points.npz"):
             raise NothingToView("the model has no measured points: it was not made from a sweep")
         measured: Floats = self.model.points().points.astype(np.float32)

@@ -22,7 +22,6 @@ from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.files.strands.npz import read_npz, read_npz_poses, write_npz
 from reconstruction.files.strands.photobooth import read_data
 from reconstruction.files.strands.tressfx import read_tfx
-from reconstruction.files.strands.usd import read_usd, write_usd
 from reconstruction.geometry.strands import Strands
 
 __all__ = [
@@ -35,13 +34,27 @@ __all__ = [
 ]
 
 _USD = (".usd", ".usda", ".usdc")
+
+
+def _read_usd(path: Path) -> Strands:
+    from reconstruction.files.strands.usd import read_usd  # loads USD's libraries
+
+    return read_usd(path)
+
+
+def _write_usd(path: Path, strands: Strands) -> None:
+    from reconstruction.files.strands.usd import write_usd
+
+    write_usd(path, strands)
+
+
 _READERS: dict[str, Callable[[Path], Strands]] = {
     **{".npz": read_npz, ".hair": read_hair, ".tfx": read_tfx, ".data": read_data},
-    **dict.fromkeys(_USD, read_usd),
+    **dict.fromkeys(_USD, _read_usd),
 }
 _WRITERS: dict[str, Callable[[Path, Strands], None]] = {
     **{".npz": write_npz, ".hair": write_hair},
-    **dict.fromkeys(_USD, write_usd),
+    **dict.fromkeys(_USD, _write_usd),
     ".abc": write_abc,
 }
 READABLE = tuple(_READERS)
@@ -72,7 +85,7 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
         strands = reader(path)
     except (ValueError, TypeError, OverflowError) as error:
         raise StrandFileError(f"{path}: {error}") from error
-    if up_axis == "y" and reader is not read_usd:
+    if up_axis == "y" and reader is not _read_usd:
         return strands.transformed(_Y_UP_TO_Z_UP, np.zeros(3))
     return strands
 
