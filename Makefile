@@ -24,8 +24,8 @@ $(BIN)/.installed: pyproject.toml
 setup: $(BIN)/.installed  ## Make .venv, install everything, find or install libLLVM >= 16 and libatomic
 	@deploy/ensure-libraries.sh
 
-demo: setup  ## Capture, reconstruct, fit and relight; SUBJECT=strands HEAD=mesh OUT=folder
-	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD))
+demo: setup  ## Capture, reconstruct, fit and relight; QUICK=1 SUBJECT=strands HEAD=mesh OUT=folder
+	$(BIN)/hairstage demo --out $(or $(OUT),runs/demo) $(if $(SUBJECT),--subject $(SUBJECT)) $(if $(HEAD),--head $(HEAD)) $(if $(QUICK),--quick)
 
 test: setup test-peers  ## Run the tests, and beside them lint and docs (under 12 minutes on 2 cores)
 	@$(MAKE) --no-print-directory -k -j 2 lint docs run-tests

@@ -10,6 +10,7 @@ from .metrics.scores import ssim as ssim
 from .model.assess import assess as assess
 from .model.fitted_model import FittedModel as FittedModel
 from .model.relight import relight as relight
+from .model.relit_pictures import relight_model as relight_model
 from .model.validated import fit_field_validated as fit_field_validated
 from .model.validated import fit_validated as fit_validated
 from .observations import HeldOut as HeldOut

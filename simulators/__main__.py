@@ -17,6 +17,7 @@ from reconstruction.geometry.rig import RigError
 from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.render_process import RenderPool
 from simulators.frames.responses import Quality, Responder, reproducible
+from simulators.frames.work import MeasuredResponder
 from simulators.peers.devices import SimulatedStage
 from simulators.peers.faults import Faults
 from simulators.peers.lamps import Lamps
@@ -87,10 +88,13 @@ def _run(
             make = functools.partial(PropResponder, rig, subject)
         names = [c.name for c in rig.cameras]
         responder = RenderPool(make, names, args.processes)
-        frames = FrameMaker(rig, responder, sensor, args.seed)
+        poses = _poses(rig_file) if args.drift_mm > 0 else 1
+        measured = MeasuredResponder(responder, rig, quality, args.processes, poses)
+        frames = FrameMaker(rig, measured, sensor, args.seed)
         log = args.truth / EXPOSURES if args.truth is not None else None
         counts = frames.counts if args.drift_mm > 0 else frames.counts_at_rest
-        world = World(rig, Lamps(len(rig.lights)), faults, counts, log, args.processes)
+        lamps = Lamps(len(rig.lights))
+        world = World(rig, lamps, faults, counts, log, args.processes, measured.busy)
         free = args.ports == "auto"
         wires, paced = rig_file.devices, args.paced
         stage = SimulatedStage(world, sensor, args.state, wires, free, paced)

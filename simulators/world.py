@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,8 @@ class World:
     first pulse after a reset if it is dark, or when a single lamp is lit.
 
     `make` renders and exposes on one thread per lane; camera number i belongs to lane i modulo
-    `lanes`. `log` gets one JSON line per pulse with its pose.
+    `lanes`. `log` gets one JSON line per pulse with its pose. `busy(camera)` has the further fields
+    of the reply for a frame that is not ready.
     """
 
     def __init__(
@@ -64,8 +66,9 @@ class World:
         make: MakeCounts,
         log: Path | None = None,
         lanes: int = 1,
+        busy: Callable[[str], dict[str, Any]] = lambda _camera: {},
     ) -> None:
-        self.rig, self.lamps, self.faults = rig, lamps, faults
+        self.rig, self.lamps, self.faults, self.busy = rig, lamps, faults, busy
         self._make, self._log = make, log
         self._pulses = self._fired = self._pose = 0
         self.projectors = SimulatedProjectorController(

@@ -18,15 +18,11 @@ from appearance.metrics.scores import (
     scores_unavailable,
     ssim,
 )
-from appearance.model.animation import turning_light, write_animation
 from appearance.model.baselines import NearestCameras, other_lights, three_nearest
 from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
-from appearance.model.relight import relight
 from appearance.observations import HeldOut, Observed, observe_hair
-from appearance.render.environment_maps import environment_map
-from appearance.render.mixed import Environment
 from appearance.render.smoothed import olat_smoothed
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_appearance import DiffuseHair
@@ -48,8 +44,6 @@ INTERPOLATED = {
 SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
 """Rows of the comparison by group."""
 MAX_DEPTH = 16
-TURNING_SIZE, TURNING_SPP = 256, 6
-"""Of `relit.webp`."""
 BASELINE_PIXELS, BASELINE_LIGHTS = 100, 48  # of each camera: what mean colour and albedo come from
 
 
@@ -68,12 +62,11 @@ def assess(
     model: Model,
     *,
     held_out: HeldOut,
-    environment: str = "studio",
     options: AssessOptions | None = None,
     progress: Progress = silent,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Compare a fitted model with held-out frames, and relight it.
+    """Compare a fitted model with held-out frames.
 
     Returns `{"held_out_lights": {method: {"psnr", "ssim", "relative_error"}}, "held_out_camera":
     …}`, means over images, each over the captured hair mask; a group with nothing held out is left
@@ -90,12 +83,10 @@ def assess(
     - "three_nearest_own_frames", of a held-out camera: its own frames, which no other method has,
       under the three nearest other training lights
 
-    Writes `comparison.png`, `relit.png` and `relit.exr` (see `relight`), `relit.webp` if
-    `options.turning_frames` is above 0 (see `turning_light`), and the stage "images" of the report,
-    which warns of every baseline that is not beaten.
+    Writes `comparison.png` and the stage "images" of the report, which warns of every baseline that
+    is not beaten.
     """
     options = options or AssessOptions()
-    envmap = environment_map(environment)
     training = held_out.training(capture)
     fitted = FittedModel.load(model, capture)
     result: dict[str, Any] = {}
@@ -106,17 +97,6 @@ def assess(
             result = comparison.run(stage, progress)
         else:
             stage.warn("no camera and no light is held out: nothing is compared")
-        progress("relighting", 0.8)
-        size, spp = options.relit_size, options.relit_spp
-        relight(fitted, model, envmap, size=size, spp=spp, seed=seed)
-        if options.turning_frames:
-            progress("relighting under light that turns", 0.9)
-            room = Environment(envmap)
-            sampling = Sampling(TURNING_SPP, MAX_DEPTH, seed)
-            turning = turning_light(fitted, room, options.turning_frames, TURNING_SIZE, sampling)
-            write_animation(model.file("relit.webp"), turning)
-        else:
-            model.remove("relit.webp")
     model.write_report(report)
     progress("images compared", 1.0)
     return {**result, **scores_unavailable()}
@@ -156,7 +136,7 @@ class _Comparison:
         for k, (group, views) in enumerate(self._views().items()):
             groups[group] = []
             for i, (camera, lights) in enumerate(views):
-                progress(f"rendering {camera}", 0.1 + 0.3 * (k + (i + 1) / len(views)))
+                progress(f"rendering {camera}", 0.1 + 0.4 * (k + i / len(views)))
                 for image in self._rendered(camera, lights, lit, stage):
                     if "ours" not in lit:
                         image.frames["ours"] = image.frames[rendered]

@@ -104,7 +104,7 @@ class _Connection:
         if frame is None:
             return {"ok": True, "status": "empty"}, b""
         if not frame.counts.done():
-            return {"ok": True, "status": "busy"}, b""
+            return {"ok": True, "status": "busy", **self._world.busy(camera)}, b""
         self._world.take(camera, frame)
         if frame.counts.cancelled():
             return {"ok": True, "status": "empty"}, b""

@@ -37,7 +37,8 @@ class FrameIntake:
             self.by_device[camera.name].update(frames=0, missed=0, late=0)
         self.withdrawn: dict[str, list[Step]] = {}
         self.pulses = PulseAccount(devices.trigger.name)
-        self._progress, self._timings, self._cancel = progress, timings, cancel
+        self._devices, self._progress = devices, progress
+        self._timings, self._cancel = timings, cancel
         self._accounts = {
             c.name: FrameAccount(c.name, c.capabilities.block_wrap) for c in devices.cameras
         }
@@ -65,11 +66,11 @@ class FrameIntake:
     def read(self, cameras: FanOut) -> dict[str, Frame | None]:
         """Each camera's frame of the newest pulse; None where it has none."""
         with self._timings.on("cameras"):
-            return cameras(self._read, self._progress.waiting)
+            return cameras(self._read, lambda: self._progress.waiting(self._devices.busy))
 
     def _read(self, camera: CameraDevice) -> Frame | None:
         frame = camera.read(self._cancel)
-        self._progress.responded()
+        self._progress.responded(camera.name)
         return frame
 
     def account(self, camera: CameraDevice, frame: Frame | None, pulse: Pulse) -> None:

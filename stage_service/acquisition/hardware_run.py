@@ -84,7 +84,10 @@ class HardwareRun:
         try:
             trigger.go()
             watch.start()
-            frames = cameras(lambda camera: self._collect(camera, watch.over, cancel))
+            frames = cameras(
+                lambda camera: self._collect(camera, watch.over, cancel),
+                lambda: self._progress.waiting(self._devices.busy),
+            )
         finally:
             watch.end()
         progress = watch.progress

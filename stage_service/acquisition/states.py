@@ -92,12 +92,25 @@ class Machine:
         return self.state
 
 
+class Waiting(BaseModel):
+    """The cameras whose frames of the current step are not there, seconds since it began, and what
+    they report to be doing ("": nothing)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    cameras: tuple[str, ...]
+    seconds: int
+    doing: str
+
+
 class Progress(BaseModel):
     """Progress of a run: the step's light, or projector and row; `by_box`: the trigger box clocks.
 
     `step` counts steps of which all frames have arrived, `frames` each camera's frames, `here`
-    cameras that have replied for the current step, `again` frames that are shot again.
-    `seconds_left` is extrapolated from measured steps, without pauses: None while they are too few.
+    cameras that have replied for the current step, `again` frames that are shot again. `waiting`
+    is set when a step takes a second longer than its exposure. `share` is the share of the time
+    that has passed, 0 to 1. `seconds_left` is extrapolated from measured steps of each kind and
+    from what busy cameras report, without pauses: None while they are too few.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -111,6 +124,8 @@ class Progress(BaseModel):
     frames: dict[str, int]
     here: int = 0
     again: int
+    waiting: Waiting | None = None
+    share: float = 0.0
     seconds_left: float | None
 
 

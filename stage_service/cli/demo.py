@@ -7,9 +7,11 @@ import json
 import os
 import shutil
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stage_service.cli.demo_kinds import FULL, QUICK, DemoKind, quick_rig
 from stage_service.cli.stage.processes import SUBJECTS, add_subject, exit_on_sigterm
 from stage_service.cli.support.commands import (
     FAILED,
@@ -18,11 +20,13 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
+    in_url,
     progress_bar,
 )
 
 if TYPE_CHECKING:
     from reconstruction import Rig
+    from stage_service.cli.demo_progress import DemoProgress
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
 
@@ -30,8 +34,11 @@ MARK = ".hairstage-demo"
 EVERY_NTH_LIGHT = 28
 """One light of so many is held out: a dozen of 331. Of few lights, four are."""
 
-TURNING_FRAMES = 36
-"""Frames of the animation at the end."""
+NAMED = {
+    "reconstruct": ("strands.npz", "strands"),
+    "relight": ("index.html", "the result, which is compared with baselines and the truth next"),
+}
+"""By step of the job: the file that shows its result, and what that is."""
 
 READY_S = 300.0
 """Deadline for a process of the demo to become ready."""
@@ -44,6 +51,7 @@ def add(commands: Commands) -> None:
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="output folder")
     demo.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
     demo.add_argument("--hold-out-camera", metavar="CAMERA", help="default: the rig's last camera")
+    demo.add_argument("--quick", action="store_true", help="fewer lights, pixels and samples")
 
 
 def run_demo(args: argparse.Namespace, output: Output) -> None:
@@ -55,6 +63,7 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     """
     from reconstruction import Model, Rig
     from reconstruction.array_backend import chosen_variant
+    from stage_service.cli.demo_progress import DemoProgress
     from stage_service.cli.demo_screen import last_screen
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
@@ -63,50 +72,65 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     begin = time.perf_counter()
     out: Path = args.out
     os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))
-    rig = Rig.load(args.rig)
-    held_out = hold_out(rig, args.hold_out_camera)
+    hold_out(Rig.load(args.rig), args.hold_out_camera)
     chosen_variant()  # fail before a process is started
     _check(args)
+    kind, quick = (QUICK, quick_rig(args.rig)) if args.quick else (FULL, None)
     _prepare(out)
+    if quick is not None:
+        output.note(kind.label)
+        args.rig = out / "rig.json"
+        args.rig.write_text(json.dumps(quick, indent=1))
+    rig = Rig.load(args.rig)
+    held_out = hold_out(rig, args.hold_out_camera)
 
-    with Children(out / "logs") as children:
+    with Children(out / "logs") as children, ExitStack() as stack:
         output.note(
             f"starting simulated rig, service and worker; their logs: {out.resolve() / 'logs'}"
         )
-        with ServiceClient(_start(children, args)) as service:
-            capture = _capture(children, service, args, held_out, output)
-            job = _job(children, service, capture["job"], out)
-
-    model = Model(out / "model")
-    results = {
-        "seconds": time.perf_counter() - begin,
-        "subject": args.subject,
-        "seed": args.seed,
-        "rig": rig.name,
-        "held_out": held_out,
-        "capture": {
-            key: capture[key]
-            for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
-        },
-        "job": job["id"],
-        **model.json("results.json"),
-    }
-    (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
-    output.result(results, last_screen(results, out))
+        with progress_bar("demo") as show:
+            progress = DemoProgress(show, kind.capture_s, kind.steps_s)
+            service = stack.enter_context(ServiceClient(_start(children, args, kind)))
+            capture = _capture(children, service, args, kind, held_out, progress, output)
+            job = _job(children, service, capture["job"], kind, progress, out, output)
+        progress.save(out / "logs" / "progress.csv")
+        results = {
+            "seconds": time.perf_counter() - begin,
+            "subject": args.subject,
+            "seed": args.seed,
+            "rig": rig.name,
+            "held_out": held_out,
+            "capture": {
+                key: capture[key]
+                for key in ("id", "seconds", "frames_planned", "frames_written", "frames_missing")
+            },
+            "job": job["id"],
+            **Model(out / "model").json("results.json"),
+        }
+        (out / "results.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+        screen = last_screen(results, out)
+        if not output.as_json:
+            output.result(results, screen)
+        with progress_bar("demo") as show:  # nobody waits for the rest
+            _check_job(service.follow_job(job["id"], show, children.check), children)
+    if output.as_json:
+        output.result(results, screen)
 
 
 def _capture(
     children: Children,
     service: ServiceClient,
     args: argparse.Namespace,
+    kind: DemoKind,
     held_out: dict[str, list[str]],
+    progress: DemoProgress,
     output: Output,
 ) -> dict[str, Any]:
     """Make the capture, whose completion enqueues the job."""
     cost = service.post("/plans:validate", {})
     output.note(
         f"the capture takes {cost['frames']} frames, {cost['bytes'] / 1e9:.1f} GB and, on real "
-        f"devices, {cost['seconds']:.0f} s; the simulated rig renders each frame"
+        f"devices, {cost['seconds']:.0f} s; the simulated rig renders them"
     )
     truth = (args.out / "truth").resolve()
     options = {
@@ -114,41 +138,70 @@ def _capture(
         "environment": args.environment,
         "seed": args.seed,
         "truth": str(truth),
-        "assess": {"turning_frames": TURNING_FRAMES},
+        "label": kind.label,
+        **kind.options,
     }
-    body: dict[str, Any] = {"plan": {}, "pipeline": {"name": "full", "options": options}}
+    body: dict[str, Any] = {"plan": {}, "pipeline": {"name": kind.pipeline, "options": options}}
     if (truth / "head.obj").is_file():
         body["head"] = str(truth / "head.obj")
     capture = service.post("/captures", body)
-    with progress_bar("capture") as progress:
-        capture = service.follow_capture(capture["id"], progress, children.check)
+    capture = service.follow(f"/captures/{capture['id']}", progress.capture, children.check)
     _link(args.out / "capture", Path(capture["path"]))
     if capture["outcome"] != "completed":
         raise CommandError(f"the capture {capture['outcome']}: {capture['error']}", FAILED)
     return capture
 
 
-def _job(children: Children, service: ServiceClient, job_id: str, out: Path) -> dict[str, Any]:
-    """Follow the job to its end."""
-    with progress_bar("job") as progress:
-        job = service.follow_job(job_id, progress, children.check)
-    _link(out / "model", Path(job["model"]))
-    if job["outcome"] != "succeeded":
+def _job(
+    children: Children,
+    service: ServiceClient,
+    job_id: str,
+    kind: DemoKind,
+    progress: DemoProgress,
+    out: Path,
+    output: Output,
+) -> dict[str, Any]:
+    """Follow the job until its results are written; names each as soon as it is there."""
+    steps = list(kind.steps_s)
+    named: set[str] = set()
+
+    def show(job: dict[str, Any]) -> None:
+        if not (out / "model").is_symlink():
+            _link(out / "model", Path(job["model"]))
+        step = job["progress"]["step"] if job["progress"] else steps[0]
+        for done in steps[: steps.index(step)] if step in steps else steps:
+            if done in NAMED and done not in named:
+                named.add(done)
+                file, what = NAMED[done]
+                output.note(f"{what}: {(out / 'model' / file).resolve()}")
+        progress.job(job)
+
+    def written(job: dict[str, Any]) -> bool:
+        return job["progress"] is not None and job["progress"]["step"] not in steps
+
+    job = service.follow(f"/jobs/{in_url(job_id)}", show, children.check, written)
+    _check_job(job, children)
+    return job
+
+
+def _check_job(job: dict[str, Any], children: Children) -> None:
+    """Raise `CommandError` for a job that has failed."""
+    if job["outcome"] not in (None, "succeeded"):
         step = job["progress"]["step"] if job["progress"] else "first"
         why = job["error"]["detail"] if job["error"] else job["outcome"]
         raise CommandError(
             f"the job failed in its {step} step: {why}; its log is {children.log('worker')}", FAILED
         )
-    return job
 
 
-def _start(children: Children, args: argparse.Namespace) -> str:
+def _start(children: Children, args: argparse.Namespace, kind: DemoKind) -> str:
     """Start the three processes; returns the service's URL when all are ready."""
     from stage_service.cli.support.children import SimulatedRig, own_command
 
     out: Path = args.out
     simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed).command(
-        *("--state", out / "simulated", "--truth", out / "truth", "--ports", "auto")
+        *("--state", out / "simulated", "--truth", out / "truth", "--ports", "auto"),
+        *kind.simulator,
     )
     devices = children.ready("simulators", simulated, READY_S)["devices"]
     serve = own_command(

@@ -27,11 +27,15 @@ ACTION = re.compile(
 
 def last_screen(results: Mapping[str, Any], out: Path) -> str:
     """At most 25 lines on the demo's `results.json` in `out`; the model's page has all tables."""
+    model = out.resolve() / "model"
+    turning = model / "relit.webp"
+    relit = (turning, "turning") if turning.exists() else (model / "relit.png", "new")
     stages = ", ".join(f"{name} {s:.0f} s" for name, s in results["stages"].items())
     title = f"{results['subject']}, seed {results['seed']}, rig {results['rig']}"
     lines = [
         f"{title}: done in {results['seconds']:.0f} s",
         f"capture {results['capture']['seconds']:.0f} s, {stages}",
+        *([results["label"]] if "label" in results else []),
         "",
         _result(results),
         "",
@@ -40,8 +44,8 @@ def last_screen(results: Mapping[str, Any], out: Path) -> str:
         "",
         *_warnings(results["warnings"]),
         "Open next",
-        f"  {out.resolve() / 'model' / 'index.html'}: every table, picture and warning",
-        f"  {out.resolve() / 'model' / 'relit.webp'}: the hair under a turning environment",
+        f"  {model / 'index.html'}: every table, picture and warning",
+        f"  {relit[0]}: the hair under a {relit[1]} environment",
         f"  hairstage view {out / 'model'} --capture {out / 'capture'} "
         f"--truth {out / 'truth' / 'strands.npz'}",
         f"  hairstage export {out / 'model'} --to blender --out {out / 'blender'}",

@@ -16,7 +16,7 @@ from stage_service.config import (
 )
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.fan_out import FanOut
-from stage_service.devices.cameras.interface import CameraDevice
+from stage_service.devices.cameras.interface import Busy, CameraDevice
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
@@ -91,6 +91,11 @@ class DeviceSet:
             cameras(lambda camera: camera.connect())
         finally:
             cameras.close()
+
+    @property
+    def busy(self) -> dict[str, Busy]:
+        """The reports of the cameras whose frames are not ready, by name."""
+        return {c.name: busy for c in self.cameras if (busy := c.busy) is not None}
 
     def require_power(self) -> None:
         """Raise `DeviceError` for a projector that is not on: its rows would be dark."""

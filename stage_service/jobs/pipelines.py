@@ -3,26 +3,40 @@
 from __future__ import annotations
 
 PIPELINES: dict[str, tuple[str, ...]] = {
-    "light_planes": ("reconstruct", "fit", "assess", "evaluate", "results", "compress"),
+    "light_planes": ("reconstruct", "fit", "relight", "assess", "evaluate", "results", "compress"),
     "full": (
         "reconstruct",
         "fit",
         "inverse_rendering",
+        "relight",
         "assess",
         "evaluate",
         "results",
         "compress",
     ),
     "reconstruct": ("reconstruct", "evaluate", "results"),
-    "fit": ("fit", "assess", "results"),
-    "appearance": ("fit", "inverse_rendering", "assess", "results"),
-    "fields": ("fit", "inverse_rendering", "fields", "assess", "results"),
+    "fit": ("fit", "relight", "assess", "results"),
+    "appearance": ("fit", "inverse_rendering", "relight", "assess", "results"),
+    "fields": ("fit", "inverse_rendering", "fields", "relight", "assess", "results"),
 }
 """Each step is a checkpoint: after a crash the job resumes at the step that was under way.
-Compression is last, so that it delays no results."""
+The result comes first; comparisons and compression delay nobody."""
 
-RENDERING = frozenset({"fit", "inverse_rendering", "fields", "assess"})
+SECONDS = {
+    "reconstruct": 166,
+    "fit": 63,
+    "inverse_rendering": 60,
+    "fields": 120,
+    "relight": 80,
+    "assess": 60,
+    "evaluate": 148,
+    "results": 3,
+    "compress": 20,
+}
+"""Duration of steps of the demo on two cores, for the share of a job that is done."""
+
+RENDERING = frozenset({"fit", "inverse_rendering", "fields", "relight", "assess"})
 """Steps that run several times faster on a GPU."""
 
-STEPS_VERSION = "5"
+STEPS_VERSION = "6"
 """Raise it when a pipeline's steps change: jobs of another version are not resumed."""

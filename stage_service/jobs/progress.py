@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from reconstruction import Model
+from stage_service.jobs.pipelines import SECONDS
 from stage_service.jobs.records import JobProgress
 
 EVERY_S = 0.2
@@ -54,13 +55,14 @@ class StepProgress:
         stop = self._interrupted()
         if stop is not None:
             raise stop
+        seconds = [SECONDS[step] for step in self._steps]
         done = self._steps.index(self._step)
         self._share = step_share = max(self._share, min(share, 1.0))
         progress = JobProgress(
             step=self._step,
             steps=self._steps,
             what=what,
-            share=(done + step_share) / len(self._steps),
+            share=(sum(seconds[:done]) + step_share * seconds[done]) / sum(seconds),
             step_share=step_share,
         )
         data = {"job": self._job, **progress.model_dump(mode="json")}

@@ -11,8 +11,9 @@ from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
 from reconstruction.methods import Method
-from stage_service.config import Names, Strict
+from stage_service.config import Names, Strict, Text
 from stage_service.jobs.pipelines import PIPELINES
+from stage_service.plan.person_text import ONE_LINE
 
 JobState = Literal["queued", "running", "done"]
 JobOutcome = Literal["succeeded", "failed", "cancelled"]
@@ -27,10 +28,12 @@ class JobOptions(Strict):
     """Options of a pipeline.
 
     `held_out_cameras` and `held_out_lights` are excluded from reconstruction and fit; their images
-    validate the result. `truth` is a strand file to evaluate against, or a folder with
-    `strands.npz` and `appearance.json`; `environment` a `.hdr` or `.exr` file, `studio` or `sky`.
-    With `reduced` n every step works on means over n × n pixels. `reconstruct`, `fit`,
-    `inverse_rendering`, `fields` and `assess` are the options of the step of that name.
+    validate the result. `label` is shown on the model's page. `truth` is a strand file to evaluate
+    against, with baselines of strands unless `baselines` is false, or a folder with `strands.npz`
+    and `appearance.json`; `environment` a `.hdr` or `.exr`
+    file, `studio` or `sky`. With `reduced` n every step works on means over n × n pixels.
+    `reconstruct`, `fit`, `inverse_rendering`, `fields` and `assess` are the options of the step of
+    that name; those of `assess` include the relit pictures'.
     """
 
     method: Method = "light_planes"
@@ -38,6 +41,8 @@ class JobOptions(Strict):
     held_out_cameras: Names = ()
     held_out_lights: Names = ()
     reduced: int = Field(default=1, ge=1, le=64)
+    baselines: bool = True
+    label: Annotated[str, Text, Field(max_length=200), ONE_LINE] = ""
     environment: str = "studio"
     truth: str | None = None
     seed: int = Field(default=0, ge=0, lt=2**32)
@@ -86,7 +91,8 @@ class PipelineRequest(Strict):
 
 
 class JobProgress(Strict):
-    """A job's progress: `share` of the whole job and `step_share` of this step, 0 to 1."""
+    """A job's progress, 0 to 1: `share` of the whole job, by the usual durations of its steps, and
+    `step_share` of this step."""
 
     step: str
     steps: tuple[str, ...]

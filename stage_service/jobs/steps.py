@@ -95,12 +95,28 @@ def fields(context: StepContext) -> Figures:
     return run(**context.for_appearance(), request=context.options.fields)
 
 
-def assess(context: StepContext) -> Figures:
-    """Held-out images beside the captured ones, and a relit picture."""
-    from appearance import assess as run
+def relight(context: StepContext) -> Figures:
+    """Relit pictures, and the model's page: the result, before it is compared with anything."""
+    from appearance import relight_model as run
+    from stage_service.model_page import write_page
 
     job = context.options
-    return run(**context.for_appearance(), environment=job.environment, options=job.assess)
+    run(
+        context.frames(),
+        context.model,
+        environment=job.environment,
+        options=job.assess,
+        progress=context.progress,
+        seed=job.seed,
+    )
+    return {"page": write_page(context.model, job.label).name}
+
+
+def assess(context: StepContext) -> Figures:
+    """Held-out images beside the captured ones."""
+    from appearance import assess as run
+
+    return run(**context.for_appearance(), options=context.options.assess)
 
 
 def evaluate(context: StepContext) -> Figures:
@@ -115,6 +131,7 @@ def evaluate(context: StepContext) -> Figures:
         context.model,
         truth / "strands.npz" if truth.is_dir() else truth,
         held_out_cameras=context.options.held_out_cameras,
+        baselines=context.options.baselines,
         seed=context.options.seed,
         progress=context.progress,
     )
@@ -148,6 +165,8 @@ def results(context: StepContext) -> Figures:
                 figures[key] = geometry.pop(key)
         figures["geometry"] = geometry
         plot_geometry({"ours": geometry, **figures["baselines"]}, model.file("plots/geometry.png"))
+    if context.options.label:
+        figures["label"] = context.options.label
     figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
     model.write_json("results.json", figures)
     return {"results": "results.json", "page": write_page(model).name}
@@ -159,6 +178,7 @@ _ALL = (
     fit,
     inverse_rendering,
     fields,
+    relight,
     assess,
     evaluate,
     results,

@@ -47,17 +47,19 @@ SHOWN = {
 }
 
 
-def write_page(model: Model) -> Path:
-    """Write the `index.html` of `model`; returns its path."""
+def write_page(model: Model, label: str = "") -> Path:
+    """Write the `index.html` of `model`, see `model_page`; returns its path."""
     with model.writing(PAGE) as part:
-        part.write_text(model_page(model), encoding="utf-8")
+        part.write_text(model_page(model, label), encoding="utf-8")
     return model.file(PAGE)
 
 
-def model_page(model: Model) -> Html:
-    """The page of `model`, with or without strands."""
+def model_page(model: Model, label: str = "") -> Html:
+    """The page of `model`, with or without strands; `label` stands under its name, by default that
+    of its results."""
     report = model.report()
     results = model.json("results.json") if model.has("results.json") else {}
+    label = label or results.get("label", "")
     name = model.path.resolve().name
     warnings = [(s.name, w) for s in report.stages for w in s.warnings]
     parts = {
@@ -89,6 +91,7 @@ def model_page(model: Model) -> Html:
         "header",
         element("p", "hairstage model", class_="kind"),
         element("h1", name),
+        *([element("p", label)] if label else []),
         element("nav", *menu, aria_label="parts of this page"),
     )
     foot = element("footer", f"Written by hairstage {version('hairstage')}.")

@@ -86,6 +86,7 @@ class TinyStage:
         self.rig.write_text(RIG.replace("WATCHDOG_S", str(self.watchdog_s)))
         _write_subject(folder)
         self._running: list[subprocess.Popen[str]] = []
+        self.waited_for: list[dict[str, Any]] = []  # by `capture`
         self.workers: list[subprocess.Popen[str]] = []
         self.http = httpx.Client(timeout=120, trust_env=False)
 
@@ -161,9 +162,14 @@ class TinyStage:
     def capture(self, body: dict[str, Any]) -> dict[str, Any]:
         """Make a capture and wait until it is done."""
         path = f"/captures/{self.post('/captures', body)['id']}"
-        self.until(lambda: self.get(path)["state"] == "done", 120)
-        done: dict[str, Any] = self.get(path)
-        return done
+        self.until(lambda: self._look(path)["state"] == "done", 120)
+        return self._look(path)
+
+    def _look(self, path: str) -> dict[str, Any]:
+        status: dict[str, Any] = self.get(path)
+        if status["progress"] and status["progress"]["waiting"]:
+            self.waited_for.append(status["progress"])
+        return status
 
     def lamps_lit(self) -> int:
         """Lamps that are lit, asked over Modbus TCP by hand (read input register 1 of unit 1)."""

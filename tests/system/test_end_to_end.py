@@ -59,6 +59,16 @@ def test_a_capture_has_every_frame_each_of_its_own_lamp(running, captured):
     assert len({p.tobytes() for p in pictures}) == 4
 
 
+def test_while_the_rig_renders_the_service_says_what_it_waits_for_and_how_long(running, captured):
+    assert captured["progress"] is None
+    waited_for = [p for p in running.waited_for if p["waiting"]["doing"]]
+    assert {p["waiting"]["doing"] for p in waited_for} & {
+        f"rendering camera {k} of {running.CAMERAS}" for k in range(1, running.CAMERAS + 1)
+    }
+    assert all(p["seconds_left"] > 0 for p in waited_for)
+    assert sorted(p["share"] for p in waited_for) == [p["share"] for p in waited_for]
+
+
 def test_a_job_outlives_its_worker(finished):
     job, written = finished
     assert (job["outcome"], job["error"]) == ("succeeded", None)

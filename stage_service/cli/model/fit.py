@@ -66,6 +66,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         fields,
         fit,
         inverse_rendering,
+        relight,
     )
     from stage_service.model_page import write_page
 
@@ -103,7 +104,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     data["appearance"] = model.json("appearance.json")
     if options.held_out_cameras or options.held_out_lights:
         with progress_bar("assess") as progress:
-            data["images"] = assess(StepContext(args.capture, model, options, progress))
+            context = StepContext(args.capture, model, options, progress)
+            relight(context)
+            data["images"] = assess(context)
     write_page(model)
     data["warnings"] = [f"{s.name}: {w}" for s in model.report().stages for w in s.warnings]
     for warning in data["warnings"]:

@@ -158,50 +158,72 @@ class ServiceClient:
     ) -> dict[str, Any]:
         """Poll a capture until it is done; `check` may raise to give up waiting."""
 
-        return self._follow(
-            f"/captures/{capture}", lambda s: progress(*_capture_progress(s)), check
-        )
+        return self.follow(f"/captures/{capture}", lambda s: progress(*capture_progress(s)), check)
 
     def follow_job(
         self, job: str, progress: Progress, check: Callable[[], None] = lambda: None
     ) -> dict[str, Any]:
         """Poll a job until it is done; `check` may raise to give up waiting."""
 
-        def show(status: dict[str, Any]) -> None:
-            p = status["progress"]
-            if p is None:
-                progress(status["state"], 0.0)
-            else:
-                progress(f"{p['step']}: {p['what']}", p["share"])
+        return self.follow(f"/jobs/{in_url(job)}", lambda s: progress(*job_progress(s)), check)
 
-        return self._follow(f"/jobs/{in_url(job)}", show, check)
-
-    def _follow(
-        self, path: str, show: Callable[[dict[str, Any]], None], check: Callable[[], None]
+    def follow(
+        self,
+        path: str,
+        show: Callable[[dict[str, Any]], None],
+        check: Callable[[], None],
+        until: Callable[[dict[str, Any]], bool] = lambda _: False,
     ) -> dict[str, Any]:
+        """Poll the capture or job at `path` until it is done, or `until` its status; returns that.
+
+        `show` gets every status; `check` may raise to give up waiting.
+        """
         while True:
             status: dict[str, Any] = self.get(path)
             show(status)
-            if status["state"] == "done":
+            if status["state"] == "done" or until(status):
                 return status
             check()
             time.sleep(0.3)
 
 
-def _capture_progress(status: dict[str, Any]) -> tuple[str, float]:
-    """State of a capture in words, and the share of its frames that have arrived."""
+def capture_progress(status: dict[str, Any]) -> tuple[str, float]:
+    """What a capture does, in words with the time left, and the share of its time that passed."""
     running, planned = status["progress"], status["frames_planned"]
     if running is None:
-        done, more = status["frames_written"], ""
-    else:
-        by_camera = running["frames"].values()
-        done = sum(by_camera)
-        here = running["here"] or sum(n > min(by_camera) for n in by_camera)
-        of = running["light"] or running["projector"] or running["kind"]
-        more = f", {of}: {here} of {len(by_camera)} cameras" if here else ""
-        if running["seconds_left"] is not None:
-            more += f", {running['seconds_left']:.0f} s left"
-    return f"{status['state']}, {done} of {planned} frames{more}", done / max(planned, 1)
+        done = status["frames_written"]
+        return f"{status['state']}, {done:,} of {planned:,} frames", done / max(planned, 1)
+    left = running["seconds_left"]
+    time_left = "" if left is None else f", {time_text(left)} left"
+    return f"{capture_work(status)}{time_left}", running["share"]
+
+
+def capture_work(status: dict[str, Any]) -> str:
+    """What a capture does, and the frames that have arrived."""
+    running, planned = status["progress"], status["frames_planned"]
+    done = status["frames_written"] if running is None else sum(running["frames"].values())
+    frames = f"{done:,} of {planned:,} frames"
+    if running is None or (waiting := running["waiting"]) is None:
+        return f"{status['state']}, {frames}"
+    first, *others = waiting["cameras"]
+    more = f" and {len(others)} more" if others else ""
+    doing = waiting["doing"] or f"waiting for {first}{more}"
+    return f"{doing}, {waiting['seconds']} s; {frames}"
+
+
+def job_progress(status: dict[str, Any]) -> tuple[str, float]:
+    """The step of a job in words, and the share of the job that is done."""
+    p = status["progress"]
+    return (status["state"], 0.0) if p is None else (f"{p['step']}: {p['what']}", p["share"])
+
+
+def time_text(seconds: float) -> str:
+    """A duration, to the precision of an estimate."""
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    if seconds >= 90:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds:.0f} s"
 
 
 def _problem(response: httpx.Response) -> CommandError:

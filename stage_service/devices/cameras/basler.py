@@ -17,7 +17,7 @@ from reconstruction import Camera
 from stage_service.config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.genicam_nodes import Nodes
-from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
+from stage_service.devices.cameras.interface import Busy, CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 
 SLICE_S = 0.05
@@ -61,6 +61,7 @@ class BaslerCamera:
         self.config = config
         self.geometry = geometry
         self.capabilities = CameraCapabilities(config.buffers, False, BLOCK_WRAP)
+        self.busy: Busy | None = None
         self._info: CameraInfo | None = None
         self._pylon: Any = None
         self._genicam: Any = None

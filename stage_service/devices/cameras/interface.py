@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -68,11 +69,29 @@ class CameraCapabilities:
     block_wrap: int
 
 
+@dataclass(frozen=True)
+class Busy:
+    """What a camera reports of a frame that is not ready: what it does, and in how many seconds
+    the frame is ready.
+
+    `frame_s`: seconds until a later frame of a kind of step is ready, for the kinds that take
+    longer than the others.
+    """
+
+    doing: str = ""
+    left_s: float | None = None
+    frame_s: Mapping[str, float] = field(default_factory=dict)
+
+
 class CameraDevice(Protocol):
-    """One camera that waits for hardware triggers. Every call raises `DeviceError`."""
+    """One camera that waits for hardware triggers. Every call raises `DeviceError`.
+
+    `busy` is the camera's latest report while `read` waits, else None.
+    """
 
     name: str
     capabilities: CameraCapabilities
+    busy: Busy | None
 
     @property
     def info(self) -> CameraInfo:

@@ -14,14 +14,15 @@ import numpy as np
 from reconstruction import Camera
 from reconstruction.reading import parse_json
 from stage_service.config import LinkCamerasConfig
-from stage_service.devices.cameras.interface import CameraCapabilities, CameraInfo, Frame
+from stage_service.devices.cameras.interface import Busy, CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 
 BLOCK_WRAP = 65535
 LONGEST_HEADER = 1 << 20
 LONGEST_PAYLOAD = 1 << 30
-POLL_S = (0.001, 0.05)
-"""Wait before a busy camera is read again: the first, doubled up to the second."""
+LONGEST_DOING = 100
+POLL_S = (0.001, 0.25)
+"""Wait before a busy camera is read again: a quarter of the time so far, within these limits."""
 
 
 class LinkCamera:
@@ -33,6 +34,7 @@ class LinkCamera:
         self.device = f"camera {geometry.name} ({config.host}:{config.port})"
         self.config = config
         self.geometry = geometry
+        self.busy: Busy | None = None
         self._info: CameraInfo | None = None
         self._socket: socket.socket | None = None
         self._armed: float | None = None
@@ -88,10 +90,15 @@ class LinkCamera:
         self._armed = None
 
     def read(self, cancel: threading.Event) -> Frame | None:
+        try:
+            return self._read(cancel)
+        finally:
+            self.busy = None
+
+    def _read(self, cancel: threading.Event) -> Frame | None:
         doing = "reading a frame"
         busy_s = self.config.busy_s
-        deadline = time.monotonic() + busy_s
-        wait = POLL_S[0]
+        began = time.monotonic()
         while True:
             reply, payload = self._request({"op": "read"}, doing)
             status = reply.get("status")
@@ -102,13 +109,14 @@ class LinkCamera:
             if status != "busy":
                 todo = "Check that the camera follows docs/reference/wire.md."
                 raise self._error(doing, "the status frame, busy or empty", repr(status), todo)
-            if time.monotonic() > deadline:
+            waited = time.monotonic() - began
+            if waited > busy_s:
                 todo = "Check the camera, or raise busy_s in [devices.cameras]."
                 received = "busy all the time"
                 raise DeviceTimeout(self.device, doing, "a frame", received, todo, busy_s)
-            if cancel.wait(wait):
+            self.busy = _busy(reply)
+            if cancel.wait(min(max(waited / 4, POLL_S[0]), POLL_S[1])):
                 raise Cancelled(f"{self.device}: {doing} was given up")
-            wait = min(2 * wait, POLL_S[1])
 
     def _frame(self, reply: dict[str, Any], payload: bytes, doing: str) -> Frame:
         info = self.info
@@ -190,3 +198,19 @@ class LinkCamera:
 
     def _error(self, doing: str, expected: str, received: str, todo: str) -> DeviceError:
         return DeviceError(self.device, doing, expected, received, todo)
+
+
+def _busy(reply: dict[str, Any]) -> Busy:
+    """What a busy camera reports, without fields of another type."""
+    doing, frame_s = reply.get("doing"), reply.get("frame_s")
+    found = frame_s.items() if isinstance(frame_s, dict) else ()
+    return Busy(
+        doing[:LONGEST_DOING] if isinstance(doing, str) else "",
+        _seconds(reply.get("left_s")),
+        {kind: s for kind, value in found if (s := _seconds(value)) is not None},
+    )
+
+
+def _seconds(value: Any) -> float | None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return max(float(value), 0.0) if number else None

@@ -89,7 +89,7 @@ function jobOf(view, id) {
     const rows = {
       "Pipeline": job.pipeline, "State": job.outcome ?? job.state, "Capture": job.capture.split("/").at(-1), "Model": job.model.split("/").at(-1),
       "Started": clock(job.started), "Duration": job.finished && job.started ? seconds((new Date(job.finished) - new Date(job.started)) / 1000) : "–",
-      ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}, if all steps take equally long` } : {}),
+      ...(job.state === "running" ? { "Time left": `about ${seconds(timeLeft())}` } : {}),
     };
     setContent(facts, definitions(rows));
     setContent(wrong, job.error ? `${local(job.error.detail)} (${job.error.type})` : "");

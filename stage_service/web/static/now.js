@@ -25,7 +25,7 @@ export function open(view) {
   const lit = h("p.lit", { "aria-live": "off" });
   const word = h("h1.big");
   const status = h("p.status");
-  const meter = h("progress", { "aria-label": "steps" });
+  const meter = h("progress", { "aria-label": "capture", max: 1 });
   const facts = h("dl.facts");
   const cameras = h("table.cameras", h("thead", h("tr", h("th", "camera"), h("th.n", "frames"), h("td"))), h("tbody"));
   const byCamera = h("section", h("h2", "Frames by camera"), cameras);
@@ -95,9 +95,8 @@ export function open(view) {
     }
     headline(c);
     meter.hidden = false;
-    meter.max = c.steps || 1;
-    meter.value = c.step;
     const p = c.progress;
+    meter.value = p?.share ?? c.step / (c.steps || 1);
     const frames = p ? Object.values(p.frames).reduce((a, b) => a + b, 0) : c.frames_written;
     showFacts([
       ["Capture", h("a", { href: `#frames/${encodeURIComponent(c.id)}` }, c.id)],
@@ -176,7 +175,9 @@ export function open(view) {
     const what = !running || !now.kind ? (busy() ? STATE_TEXT[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
     const responded = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have responded` : "";
-    setContent(lit, busy() && !silence() ? what + responded : lampWords(S.health).lit);
+    const w = running ? p?.waiting : null;
+    const waiting = w ? ` · ${w.doing || `waiting for ${w.cameras[0]}${w.cameras.length > 1 ? ` and ${number(w.cameras.length - 1)} more` : ""}`}, ${seconds(w.seconds)}` : "";
+    setContent(lit, busy() && !silence() ? what + responded + waiting : lampWords(S.health).lit);
   }
 
   function waitsAt(step) {

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from reconstruction import Step
 from stage_service.acquisition.progress import RunProgress
-from stage_service.acquisition.states import Progress
+from stage_service.acquisition.states import Progress, Waiting
+from stage_service.devices.cameras.interface import Busy
 
 STEPS = [
     *(Step(i, "olat", 0.01, light=f"light_{i:03d}") for i in range(10)),
@@ -25,9 +26,9 @@ def test_time_left_is_that_of_the_steps_that_were_measured():
     for step in STEPS[:10]:
         run.begin(step)
         clock.now += 60.0 if step.index == 0 else 2.0  # the first waits for a camera to warm up
-        run.responded()
+        run.responded("a")
         assert (reported[-1].here, reported[-1].frames["a"]) == (1, step.index)
-        run.responded()
+        run.responded("b")
         run.arrived("a")
         run.arrived("b")
         run.done(step)
@@ -52,12 +53,12 @@ def test_progress_within_the_interval_is_reported_once_while_the_run_waits():
     clock, reported = Watch(), list[Progress]()
     run = RunProgress(STEPS, dict.fromkeys("abcd", 0), reported.append, clock)
     run.begin(STEPS[0])
-    for _ in range(3):
-        run.responded()
+    for camera in "abc":
+        run.responded(camera)
     assert [now.here for now in reported] == [0]
+    clock.now += 1.0
     for _ in range(9):
-        clock.now += 1.0
-        run.waiting()
+        run.waiting({})
     assert [now.here for now in reported] == [0, 3]
 
 
@@ -78,3 +79,56 @@ def test_a_run_of_the_box_is_as_far_as_its_slowest_camera():
     run.end_run({"a": 5, "b": 3})
     assert run.now().frames == {"a": 8, "b": 6}
     assert not run.now().by_box
+
+
+def test_what_busy_cameras_report_predicts_the_rest_and_what_is_waited_for():
+    clock = Watch()
+    steps = [Step(0, "all_on", 0.02), *STEPS, *(Step(30 + i, "tracking", 0.02) for i in range(4))]
+    run = RunProgress(steps, {"a": 0, "b": 0}, lambda _: None, clock)
+    run.begin(steps[0])
+    clock.now += 1.0
+    assert run.now().waiting is None, "a second is no wait"
+    clock.now += 19.0
+    run.responded("a")
+    assert (run.now().waiting.doing, run.now().seconds_left) == ("", None)
+    rendering = Busy("rendering camera 2 of 2", 60.0, {"tracking": 15.0})
+    run.waiting({"b": rendering})
+    now = run.now()
+    assert now.waiting == Waiting(cameras=("b",), seconds=20, doing="rendering camera 2 of 2")
+    expected = 60.0 + 30 * 0.01 + 4 * 15.02
+    assert now.seconds_left == round(expected, 1)
+    assert now.share == round(20 / (20 + expected), 4)
+    clock.now += 60.0
+    run.done(steps[0])
+    for step in STEPS:
+        run.begin(step)
+        clock.now += 0.5
+        run.done(step)
+    now = run.now()
+    assert now.waiting is None
+    assert now.seconds_left == round(4 * 15.02, 1)
+    assert now.share == round(95 / (95 + 4 * 15.02), 4)
+
+
+def test_a_slow_first_step_is_not_the_pace_and_a_longer_exposure_takes_longer():
+    clock = Watch()
+    closing = [Step(30, "all_on", 0.02), Step(31, "tracking", 2.0)]
+    run = RunProgress([*STEPS[:10], *closing], {"a": 0}, lambda _: None, clock)
+    for step in STEPS[:10]:
+        run.begin(step)
+        clock.now += 600.0 if step.index == 0 else 0.11
+        run.done(step)
+    assert run.now().seconds_left == round(0.12 + 2.1, 1)
+
+
+def test_the_share_of_a_continued_run_begins_with_the_steps_shot_before():
+    clock = Watch()
+    run = RunProgress(STEPS, {"a": 10}, lambda _: None, clock)
+    run.skip(STEPS[:15])
+    assert run.now().share == 0.5
+    for step in STEPS[15:20]:
+        run.begin(step)
+        clock.now += 1.0
+        run.done(step)
+    assert run.now().seconds_left == 10.0
+    assert run.now().share == round(0.5 + 0.5 * 5 / 15, 4)

@@ -135,13 +135,13 @@ def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
     made, capsys, monkeypatch
 ):
     called = []
-    for name in ("fit", "inverse_rendering", "assess"):
+    for name in ("fit", "inverse_rendering", "relight", "assess"):
         monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
     words = (capsys, "fit", made.capture, made.model, "--method", "inverse_rendering")
     assert run(*words)[0] == 0
     assert called == ["inverse_rendering"]
     assert run(*words, "--hold-out-light", "l4")[0] == 0
-    assert called[1:] == ["fit", "inverse_rendering", "assess"]
+    assert called[1:] == ["fit", "inverse_rendering", "relight", "assess"]
 
 
 @pytest.mark.usefixtures("fitted")

@@ -62,7 +62,7 @@ def test_the_result_three_figures_with_their_best_baselines_and_what_to_open():
     assert "check its pose" in text
     assert "1; 1 more on the model's page" in text
     assert "352 strands" not in text, "it asks for no action"
-    for path in ("model/index.html", "model/relit.webp", "truth/strands.npz"):
+    for path in ("model/index.html", "model/relit.png", "truth/strands.npz"):
         assert path in text
 
 
@@ -71,3 +71,16 @@ def test_it_has_at_most_25_lines_however_many_warnings_there_are():
     lines = last_screen({**RESULTS, "warnings": many}, Path("runs/demo")).splitlines()
     assert len(lines) <= 25
     assert any(line.startswith("Warnings to act on: 30") for line in lines)
+
+
+def test_light_that_turns_is_named_if_there_is_any(tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "relit.webp").touch()
+    assert "relit.webp: the hair under a turning" in last_screen(RESULTS, tmp_path)
+
+
+def test_a_quick_demo_is_labelled():
+    label = "quick demo: 24 lights; figures are not those of the full demo"
+    lines = last_screen({**RESULTS, "label": label}, Path("runs/demo")).splitlines()
+    assert lines[2] == label
+    assert label not in last_screen(RESULTS, Path("runs/demo"))

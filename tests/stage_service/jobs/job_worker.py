@@ -65,7 +65,11 @@ def light(context: steps.StepContext) -> steps.Figures:
 if __name__ == "__main__":
     worker.CANCEL_S = 1.0
     worker.LOOK_S = worker.RETRY_S = 0.2
-    steps.STEPS.update(reconstruct=first, evaluate=slow, results=last, fit=bad, assess=last)
+    steps.STEPS.update(
+        reconstruct=first, evaluate=slow, results=last, fit=bad, relight=last, assess=last
+    )
     if "light" in sys.argv:
-        steps.STEPS.update(reconstruct=light, evaluate=light, fit=light, assess=light)
+        steps.STEPS.update(
+            reconstruct=light, evaluate=light, fit=light, relight=light, assess=light
+        )
     run_worker(Path(sys.argv[1]), gpu="gpu" in sys.argv, ready=lambda name: print(name, flush=True))

@@ -1,0 +1,143 @@
+"""The rendering of frames: what is under way, and how long the rest takes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any
+
+from reconstruction import Rig
+from reconstruction.arrays import Array
+from simulators.frames.responses import Quality, Responder, Response
+
+PER_PATH_S = {"lights": (1.8e-5, 6.7e-7), "lights_together": (3.0e-6, 0.0), "sweep": (7.0e-6, 0.0)}
+"""Seconds per pixel and path on one core of the reference machine, and more for each light of the
+rig: the prediction until calls of that kind are measured."""
+OVERDUE = 1.1
+"""A call that takes longer than predicted is expected to take this multiple of its time so far."""
+
+
+@dataclass
+class _Lane:
+    """Cameras whose calls follow each other, and the call under way: for `at`, since `began`."""
+
+    cameras: Sequence[str]
+    batch: tuple[str, int] = ("", 0)
+    """What is rendered for each of the cameras, and at which pose."""
+    ready: set[str] = field(default_factory=set)
+    at: str | None = None
+    began: float = 0.0
+    compiled: set[str] = field(default_factory=set)
+
+
+class MeasuredResponder:
+    """A `Responder` that measures the calls of another, and predicts the rest.
+
+    Camera number i belongs to lane i modulo `lanes`, as in `World`; a lane's calls follow each
+    other in the rig's order. `poses` is their number in a sweep of all projectors.
+    """
+
+    def __init__(
+        self,
+        responder: Responder,
+        rig: Rig,
+        quality: Quality,
+        lanes: int,
+        poses: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._responder, self._poses, self._clock = responder, poses, clock
+        self._names = [c.name for c in rig.cameras]
+        self._lanes = [_Lane(self._names[i::lanes]) for i in range(min(lanes, len(self._names)))]
+        self._lane = {name: lane for lane in self._lanes for name in lane.cameras}
+        paths = {
+            "lights": quality.lights,
+            "lights_together": quality.together,
+            "sweep": quality.sweep,
+        }
+        self._predicted = {
+            (what, c.name): c.width * c.height * paths[what] * (each + more * len(rig.lights))
+            for what, (each, more) in PER_PATH_S.items()
+            for c in rig.cameras
+        }
+        self._lock = threading.Lock()
+        # measured / predicted seconds: of a lane's first calls, which compile, and of the others
+        self._first: dict[str, list[float]] = {what: [] for what in PER_PATH_S}
+        self._paces: dict[str, list[float]] = {what: [] for what in PER_PATH_S}
+
+    def lights(self, camera: str) -> Response:
+        """See `Responder.lights`."""
+        with self._measured("lights", camera, 0):
+            return self._responder.lights(camera)
+
+    def lights_together(self, camera: str, pose: int, power: Array) -> Response:
+        """See `Responder.lights_together`; `power (L,)`."""
+        with self._measured("lights_together", camera, pose):
+            return self._responder.lights_together(camera, pose, power)
+
+    def sweep(self, camera: str, pose: int) -> Mapping[str, Response]:
+        """See `Responder.sweep`."""
+        with self._measured("sweep", camera, pose):
+            return self._responder.sweep(camera, pose)
+
+    def busy(self, camera: str) -> dict[str, Any]:
+        """`doing`, `left_s` and `frame_s` of a frame of `camera` that is not ready, as in
+        docs/reference/wire.md; empty while nothing is rendered for it."""
+        with self._lock:
+            lane = self._lane[camera]
+            what, pose = lane.batch
+            if lane.at is None or camera in lane.ready:
+                return {}
+            ready = sum(len(x.ready) for x in self._lanes if x.batch == lane.batch)
+            doing = f"rendering camera {ready + 1} of {len(self._names)}"
+            if what == "sweep":
+                doing += f", pose {pose + 1} of {self._poses}"
+            until = lane.cameras[: lane.cameras.index(camera) + 1]
+            left = self._seconds(what, [c for c in until if c not in lane.ready])
+            left -= self._clock() - lane.began
+            later = {"all_on": "lights_together"}
+            if self._poses > 1:  # each tracking frame begins one
+                later["tracking"] = "sweep"
+            frame_s = {
+                kind: max(self._seconds(w, x.cameras) for x in self._lanes)
+                for kind, w in later.items()
+            }
+            return {"doing": doing, "left_s": left, "frame_s": frame_s}
+
+    def _seconds(self, what: str, cameras: Sequence[str]) -> float:
+        """Expected seconds of one call each, one after the other."""
+        return self._pace(what) * sum(self._predicted[what, c] for c in cameras)
+
+    def _pace(self, what: str) -> float:
+        """Measured over predicted seconds of calls of this kind, or of all."""
+        every = [pace for paces in self._paces.values() for pace in paces]
+        first = [pace for paces in self._first.values() for pace in paces]
+        measured = self._paces[what] or self._first[what] or every or first or [1.0]
+        now = self._clock()
+        late = [
+            OVERDUE * (now - lane.began) / self._predicted[what, lane.at]
+            for lane in self._lanes
+            if lane.at is not None and lane.batch[0] == what
+        ]
+        return max([median(measured), *late])
+
+    @contextmanager
+    def _measured(self, what: str, camera: str, pose: int) -> Iterator[None]:
+        lane = self._lane[camera]
+        with self._lock:
+            if lane.batch != (what, pose):
+                lane.batch, lane.ready = (what, pose), set()
+            lane.at, lane.began = camera, self._clock()
+        try:
+            yield
+        finally:
+            with self._lock:
+                pace = (self._clock() - lane.began) / self._predicted[what, camera]
+                (self._paces if what in lane.compiled else self._first)[what].append(pace)
+                lane.compiled.add(what)
+                lane.ready.add(camera)
+                lane.at = None
