@@ -17,6 +17,7 @@ from appearance.model.fitted_model import FittedModel
 from appearance.model.interpolated import GuidedFrames
 from appearance.model.options import AssessOptions
 from appearance.model.relight import relight, three_quarter_view
+from appearance.model.relit_pictures import relight_model
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import environment_map
 from appearance.render.smoothed import olat_smoothed, smoothed, without_rare
@@ -122,11 +123,6 @@ def test_pictures_and_report_are_left_in_the_model(made, result):
     assert not unbeaten
     comparison = cv2.imread(str(model.file("comparison.png")))
     assert comparison.shape[1] > comparison.shape[0] / 2 > 200
-    relit, _ = read_exr(model.file("relit.exr"))
-    picture = cv2.imread(str(model.file("relit.png")))
-    assert picture.shape == relit.shape == (32, 32, 3)
-    assert (relit > 0).any()
-    assert picture.max() == 255
 
 
 def test_a_baseline_that_is_not_beaten_is_warned_of():
@@ -165,9 +161,7 @@ def test_a_black_frame_is_not_compared(made, quick, monkeypatch):
     assert "cam_0, l4: the hair is black" in " ".join(model.report()["images"].warnings)
 
 
-def test_if_every_held_out_frame_is_black_the_model_is_still_relit(
-    made, quick, tmp_path, monkeypatch
-):
+def test_if_every_held_out_frame_is_black_nothing_is_compared(made, quick, tmp_path, monkeypatch):
     capture, model, _ = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)
@@ -185,7 +179,6 @@ def test_if_every_held_out_frame_is_black_the_model_is_still_relit(
     assert sum("black or saturated" in w for w in warnings) == 2
     assert "nothing is compared" in warnings[-1]
     assert not other.has("comparison.png")
-    assert other.has("relit.png")
 
 
 def test_a_camera_that_meets_no_strand_leaves_out_the_baseline_on_strands(
@@ -207,16 +200,30 @@ def test_a_camera_that_meets_no_strand_leaves_out_the_baseline_on_strands(
     assert rows == {"ours", "mean_colour", "diffuse", "three_nearest_own_frames"}
 
 
-def test_without_held_out_frames_the_model_is_relit_with_a_warning(made, tmp_path):
+def test_without_held_out_frames_a_warning_is_all(made, tmp_path):
     capture, model, _ = made
     copy = Model(tmp_path / "copy")
     shutil.copytree(model.path, copy.path)
-    for name in ("relit.png", "comparison.png", "report.json"):
+    for name in ("comparison.png", "report.json"):
         copy.remove(name)
     assert set(assess(capture, copy, held_out=HeldOut(), options=OPTIONS)) <= {"lpips"}
-    assert copy.has("relit.png")
     assert not copy.has("comparison.png")
     assert "nothing is compared" in copy.report()["images"].warnings[0]
+
+
+def test_a_model_is_relit_without_what_an_earlier_relighting_left(made, tmp_path):
+    capture, model, _ = made
+    copy = Model(tmp_path / "copy")
+    shutil.copytree(model.path, copy.path)
+    copy.file("relit.webp").touch()
+    relight_model(capture, copy, options=OPTIONS)
+    relit, _ = read_exr(copy.file("relit.exr"))
+    picture = cv2.imread(str(copy.file("relit.png")))
+    assert picture.shape == relit.shape == (32, 32, 3)
+    assert (relit > 0).any()
+    assert picture.max() == 255
+    assert not copy.has("relit.webp")
+    assert copy.report()["relighting"].seconds > 0
 
 
 def test_three_nearest_lights_are_training_lights(made):
