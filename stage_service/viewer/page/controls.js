@@ -34,11 +34,11 @@ export class Controls {
   constructor(panel, viewer) {
     Object.assign(this, { panel, viewer });
     const { about } = viewer, { model } = about.strands;
+    const [half, most, all] = model.deviation_mm.map((mm) => mm.toFixed(2));
     panel.replaceChildren(
       element("h1", { textContent: about.name }),
-      element("p", { textContent: `${count(model.count)} strands of ${model.points} points, half ` +
-        `of the model's points within ${model.deviation_mm[0].toFixed(2)} mm of them, 95 % within ` +
-        `${model.deviation_mm[1].toFixed(2)}, all within ${model.deviation_mm[2].toFixed(2)}` }),
+      element("p", { textContent: `${count(model.count)} strands of ${model.points} points. Distance of ` +
+        `the model's points from them: median ${half} mm, 95 % ${most} mm, maximum ${all} mm.` }),
       ...this.strands(), ...this.cameras());
     this.light().catch((error) => viewer.status(error.message));
   }

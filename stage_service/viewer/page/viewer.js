@@ -174,7 +174,7 @@ function showTokenForm(why) {
   const field = element("input",
     { type: "password", name: "token", autocomplete: "current-password", ariaLabel: "token" });
   const form = element("form", {}, element("h1", { textContent: "Log in" }),
-    element("p", { textContent: "hairstage token show prints your token." }), field,
+    element("p", { textContent: "Your token is printed by: hairstage token show" }), field,
     element("button", { textContent: "Open" }));
   form.addEventListener("submit", async (e) => {
     e.preventDefault();
