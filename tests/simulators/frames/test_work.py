@@ -24,9 +24,9 @@ class Slow:
         self.now, self.seconds, self.said = 50.0, 8.0, list[dict]()
         self.measured: MeasuredResponder | None = None
 
-    def _render(self, observed_folder: str) -> Response:
+    def _render(self, camera: str) -> Response:
         self.now += self.seconds / 2
-        self.said.append(self.measured.busy(observed_folder))
+        self.said.append(self.measured.busy(camera))
         self.now += self.seconds / 2
         return Response(np.arange(0), np.zeros((1, 0, 3), np.float32))
 
