@@ -10,15 +10,16 @@ export PYTHONDONTWRITEBYTECODE :=
 help:  ## Say what the targets do
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
+# the newest pip takes half the time of Python 3.11's, and bytecode is compiled on all cores
 $(BIN)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "hairstage needs Python 3.11 or newer; set PYTHON=python3.x"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) 2>/dev/null || { \
 	  echo "installing python3-venv (Debian ships Python without it)"; \
 	  deploy/install-debian-package.sh python3-venv && $(PYTHON) -m venv $(VENV); }
-	$(BIN)/python -m pip install -q --disable-pip-version-check -U pip # Python 3.11's takes twice as long
-	$(BIN)/python -m pip install -q --disable-pip-version-check --no-compile -e '.[dev]'
-	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib reconstruction appearance stage_service simulators || true
+	$(BIN)/python -m pip install -q --disable-pip-version-check -U pip
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -e '.[dev]'
+	-@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib reconstruction appearance stage_service simulators
 	@touch $@
 
 setup: $(BIN)/.installed  ## Make .venv, install everything, find or install libLLVM >= 16 and libatomic
