@@ -280,6 +280,7 @@ def test_auto_with_a_head_and_with_nothing_but_masks(unswept: Capture, tmp_path:
     runs_down(read_strands(tmp_path / "dark" / "strands.npz"))
 
 
+@pytest.mark.slow
 def test_same_seed_same_strands(unswept: Capture, tmp_path: Path) -> None:
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder in folders:
@@ -297,8 +298,8 @@ def test_a_sweep_is_triangulated(
     cameras = [stage_camera(n, a, 10.0, size=96) for n, a in (("left", -40), ("right", 35))]
     capture = shoot(cameras=cameras, lights=LIGHTS, extra=hair)
     write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(capture, Model(tmp_path), options=QUICK)
-    estimated = estimate(capture, method="light_planes", options=QUICK)
+    report = reconstruct(capture, Model(tmp_path), options=COARSE)
+    estimated = estimate(capture, method="light_planes", options=COARSE)
     assert [s.name for s in estimated.stages] == [s.name for s in report.stages]
     assert not report["triangulation"].left_out
     assert report["motion"].seconds > 0
@@ -340,6 +341,7 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     assert not (tmp_path / "model" / "head.obj").exists()
 
 
+@pytest.mark.slow
 def test_a_missing_sweep_gives_a_warning(
     shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
 ) -> None:

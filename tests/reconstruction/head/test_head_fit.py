@@ -121,7 +121,7 @@ def test_inward_normals_raise_an_error(part: Part) -> None:
     head = generic_head()
     places, normals, face = surface_samples(head, 6e-3)
     on = head.scalp[face] if part == "scalp" else np.ones(len(face), bool)
-    points, outward = 1.03 * places[on][::4] + [0.01, 0.02, 0.03], normals[on][::4]
+    points, outward = 1.03 * places[on][::12] + [0.01, 0.02, 0.03], normals[on][::12]
     hints = HeadHints(part=part)
     assert not fit_head(points, outward, hints=hints).warnings
     with pytest.raises(HeadFitError, match="the normals point into the head: reverse them"):

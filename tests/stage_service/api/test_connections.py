@@ -172,7 +172,7 @@ def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):
         assert "Too many open files" not in errors.read_text()
 
 
-@pytest.mark.parametrize("host", ["::1", "[::1]"])
+@pytest.mark.parametrize("host", ["::1", pytest.param("[::1]", marks=pytest.mark.slow)])
 def test_serve_responds_on_ipv6_loopback_to_names_in_any_case(rig_file, tmp_path, host):
     command = [sys.executable, "-m", "stage_service.cli", "serve", "--json", "--port", "0"]
     command += ["--rig", str(rig_file.path), "--root", str(tmp_path / "root"), "--no-auth"]
