@@ -17,6 +17,8 @@ from simulators.frames.responses import Quality, Responder, Response
 PER_PATH_S = {"lights": (1.8e-5, 6.7e-7), "lights_together": (3.0e-6, 0.0), "sweep": (7.0e-6, 0.0)}
 """Seconds per pixel and path on one core of the reference machine, and more for each light of the
 rig: the prediction until calls of that kind are measured."""
+COMPILE_S = {"lights": 8.0, "lights_together": 3.0, "sweep": 4.0}
+"""More for the first call of a kind in a process, which builds the scene or compiles."""
 OVERDUE = 1.1
 """A call that takes longer than predicted is expected to take this multiple of its time so far."""
 
@@ -65,8 +67,7 @@ class MeasuredResponder:
             for c in rig.cameras
         }
         self._lock = threading.Lock()
-        # measured / predicted seconds: of a lane's first calls, which compile, and of the others
-        self._first: dict[str, list[float]] = {what: [] for what in PER_PATH_S}
+        # measured / predicted seconds
         self._paces: dict[str, list[float]] = {what: [] for what in PER_PATH_S}
 
     def lights(self, camera: str) -> Response:
@@ -109,17 +110,21 @@ class MeasuredResponder:
             return {"doing": doing, "left_s": left, "frame_s": frame_s}
 
     def _seconds(self, what: str, cameras: Sequence[str]) -> float:
-        """Expected seconds of one call each, one after the other."""
-        return self._pace(what) * sum(self._predicted[what, c] for c in cameras)
+        """Expected seconds of one call each for cameras of a lane, one after the other."""
+        return self._pace(what) * self._usual(what, cameras)
+
+    def _usual(self, what: str, cameras: Sequence[str]) -> float:
+        """The same on the reference machine."""
+        first = any(what not in self._lane[c].compiled for c in cameras)
+        return first * COMPILE_S[what] + sum(self._predicted[what, c] for c in cameras)
 
     def _pace(self, what: str) -> float:
         """Measured over predicted seconds of calls of this kind, or of all."""
         every = [pace for paces in self._paces.values() for pace in paces]
-        first = [pace for paces in self._first.values() for pace in paces]
-        measured = self._paces[what] or self._first[what] or every or first or [1.0]
+        measured = self._paces[what] or every or [1.0]
         now = self._clock()
         late = [
-            OVERDUE * (now - lane.began) / self._predicted[what, lane.at]
+            OVERDUE * (now - lane.began) / self._usual(what, [lane.at])
             for lane in self._lanes
             if lane.at is not None and lane.batch[0] == what
         ]
@@ -136,8 +141,8 @@ class MeasuredResponder:
             yield
         finally:
             with self._lock:
-                pace = (self._clock() - lane.began) / self._predicted[what, camera]
-                (self._paces if what in lane.compiled else self._first)[what].append(pace)
+                pace = (self._clock() - lane.began) / self._usual(what, [camera])
+                self._paces[what].append(pace)
                 lane.compiled.add(what)
                 lane.ready.add(camera)
                 lane.at = None

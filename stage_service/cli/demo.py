@@ -35,10 +35,10 @@ EVERY_NTH_LIGHT = 28
 """One light of so many is held out: a dozen of 331. Of few lights, four are."""
 
 NAMED = {
-    "reconstruct": ("strands.npz", "strands"),
-    "relight": ("index.html", "the result, which is compared with baselines and the truth next"),
+    "reconstruct": ("strands", "strands.npz", ""),
+    "relight": ("result", "index.html", "; held-out frames, baselines and the truth follow"),
 }
-"""By step of the job: the file that shows its result, and what that is."""
+"""By step of the job: its result, the file that shows it, and what comes next."""
 
 READY_S = 300.0
 """Deadline for a process of the demo to become ready."""
@@ -172,8 +172,8 @@ def _job(
         for done in steps[: steps.index(step)] if step in steps else steps:
             if done in NAMED and done not in named:
                 named.add(done)
-                file, what = NAMED[done]
-                output.note(f"{what}: {(out / 'model' / file).resolve()}")
+                what, file, then = NAMED[done]
+                output.note(f"{what}: {out.resolve() / 'model' / file}{then}")
         progress.job(job)
 
     def written(job: dict[str, Any]) -> bool:

@@ -93,6 +93,14 @@ def test_everything_that_is_known_stands_on_the_page(model):
     assert text.count("<img src=x onerror=alert(1)>") >= 5  # as text
 
 
+def test_a_label_stands_under_the_name_before_and_after_there_are_results(model):
+    label = f"quick demo: 24 lights {EVIL}"
+    assert label not in Page(model_page(model)).text
+    assert label in Page(model_page(model, label)).text
+    model.write_json("results.json", {**model.json("results.json"), "label": label})
+    assert label in Page(model_page(model)).text
+
+
 def test_commands_name_the_model_also_where_the_page_is_made_in_it(model, monkeypatch, capsys):
     monkeypatch.chdir(model.path)
     assert main(["page", "."]) == 0

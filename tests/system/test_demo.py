@@ -74,6 +74,25 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_quick_demo_is_labelled_and_names_its_result_before_the_comparisons(tmp_path):
+    out = tmp_path / "demo"
+    words = [sys.executable, "-m", "stage_service.cli", "demo", "--quick", "--out", str(out)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    label = json.loads((out / "results.json").read_text())["label"]
+    assert label.startswith("quick demo: 24 lights")
+    assert label in done.stdout
+    assert label in (out / "model" / "index.html").read_text()
+    assert "rendering camera " in done.stderr
+    strands, page, compared = (
+        done.stderr.index(text) for text in ("strands: /", "index.html", "evaluate")
+    )
+    assert strands < page < compared
+    assert processes_of(out) == []
+
+
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_in_order_and_its_folder_may_be_used_again(stage):
     out = stage.folder / "demo"
     old = out / "captures" / "old"
