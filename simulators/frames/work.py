@@ -8,17 +8,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 from reconstruction import Rig
 from reconstruction.arrays import Array
 from simulators.frames.responses import Quality, Responder, Response
 
-PER_PATH_S = {"lights": (1.8e-5, 6.7e-7), "lights_together": (3.0e-6, 0.0), "sweep": (7.0e-6, 0.0)}
-"""Seconds per pixel and path on one core of the reference machine, and more for each light of the
-rig: the prediction until calls of that kind are measured."""
-COMPILE_S = {"lights": 8.0, "lights_together": 3.0, "sweep": 4.0}
-"""More for the first call of a kind in a process, which builds the scene or compiles."""
+
+class Cost(NamedTuple):
+    """Seconds on one core of the reference machine: of a call, of its pixels' paths, more for each
+    of these and each light of the rig, and more for the first call in a process, which compiles."""
+
+    call: float
+    path: float
+    light: float
+    first: float
+
+
+COSTS = {
+    "lights": Cost(2.5, 0.8e-5, 7e-7, 6.0),
+    "lights_together": Cost(0.3, 2e-6, 0.0, 1.0),
+    "sweep": Cost(0.2, 6e-6, 0.0, 1.0),
+}
+"""The prediction until calls are measured."""
 OVERDUE = 1.1
 """A call that takes longer than predicted is expected to take this multiple of its time so far."""
 
@@ -62,13 +74,14 @@ class MeasuredResponder:
             "sweep": quality.sweep,
         }
         self._predicted = {
-            (what, c.name): c.width * c.height * paths[what] * (each + more * len(rig.lights))
-            for what, (each, more) in PER_PATH_S.items()
+            (what, c.name): cost.call
+            + c.width * c.height * paths[what] * (cost.path + cost.light * len(rig.lights))
+            for what, cost in COSTS.items()
             for c in rig.cameras
         }
         self._lock = threading.Lock()
         # measured / predicted seconds
-        self._paces: dict[str, list[float]] = {what: [] for what in PER_PATH_S}
+        self._paces: dict[str, list[float]] = {what: [] for what in COSTS}
 
     def lights(self, camera: str) -> Response:
         """See `Responder.lights`."""
@@ -116,7 +129,7 @@ class MeasuredResponder:
     def _usual(self, what: str, cameras: Sequence[str]) -> float:
         """The same on the reference machine."""
         first = any(what not in self._lane[c].compiled for c in cameras)
-        return first * COMPILE_S[what] + sum(self._predicted[what, c] for c in cameras)
+        return first * COSTS[what].first + sum(self._predicted[what, c] for c in cameras)
 
     def _pace(self, what: str) -> float:
         """Measured over predicted seconds of calls of this kind, or of all."""

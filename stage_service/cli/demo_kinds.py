@@ -35,18 +35,22 @@ FULL = DemoKind(
     787.0,
     {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"},
 )
-LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 96, 32, 16
+LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 80, 24, 24
 _SIZE = f"{LIGHTS} lights, {PIXELS} × {PIXELS} pixels"
 QUICK = DemoKind(
     "light_planes",
     {
-        "reconstruct": {"roots": 3000, "grid": 3e-3, "refine": {"steps": 1}},
-        "fit": {"hair_pixels": 400, "roughness_spp": 6, "colour_spp": 8, "iterations": 3},
+        "reconstruct": {
+            "roots": 2000,
+            "grid": 3e-3,
+            "refine": {"steps": 0, "marginal_coverage": 0},
+        },
+        "fit": {"hair_pixels": 300, "roughness_spp": 6, "colour_spp": 8, "iterations": 2},
         "assess": {"cameras": 1, "lights": 2, "spp": 8, "relit_size": 256, "relit_spp": 8},
         "baselines": False,
     },
-    45.0,
-    {"reconstruct": 30, "fit": 10, "relight": 10, "assess": 10, "evaluate": 15, "results": 2},
+    50.0,
+    {"reconstruct": 18, "fit": 10, "relight": 4, "assess": 7, "evaluate": 11, "results": 1},
     f"quick demo: {_SIZE}; figures are not those of the full demo",
     ("--spp", "8"),
 )

@@ -7,14 +7,15 @@ import pytest
 
 from reconstruction import Camera, Rig
 from simulators.frames.responses import Quality, Response
-from simulators.frames.work import COMPILE_S, OVERDUE, PER_PATH_S, MeasuredResponder
+from simulators.frames.work import COSTS, OVERDUE, MeasuredResponder
 
 CAMERAS = tuple(
     Camera.look_at(f"cam_{i}", 10, 10, (0, -1.0, 0.1 * i), (0, 0, 0), 20.0) for i in range(4)
 )
 RIG = Rig("four", CAMERAS, ())
-LIGHTS_S = 100 * 16 * PER_PATH_S["lights"][0]
-SWEEP_S = 100 * 16 * PER_PATH_S["sweep"][0]
+LIGHTS, SWEEP = COSTS["lights"], COSTS["sweep"]
+LIGHTS_S = LIGHTS.call + 100 * 16 * LIGHTS.path
+SWEEP_S = SWEEP.call + 100 * 16 * SWEEP.path
 """Seconds predicted for a camera of 100 pixels and 16 paths, after the first."""
 
 
@@ -50,19 +51,19 @@ def slow() -> Slow:
 
 def test_the_rest_of_a_lane_is_predicted_by_the_calls_that_were_measured(slow):
     # cam_0 and cam_2 are one lane; this machine takes twice as long as was predicted
-    slow.seconds = 2 * (COMPILE_S["lights"] + LIGHTS_S)
+    slow.seconds = 2 * (LIGHTS.first + LIGHTS_S)
     slow.measured.lights("cam_0")
     first = slow.said[-1]
     assert first["doing"] == "rendering camera 1 of 4"
     late = OVERDUE * slow.seconds / 2  # half of it is over, as much as was predicted
-    rest = late * (COMPILE_S["lights"] + 2 * LIGHTS_S) / (COMPILE_S["lights"] + LIGHTS_S)
+    rest = late * (LIGHTS.first + 2 * LIGHTS_S) / (LIGHTS.first + LIGHTS_S)
     assert first["left_s"] == pytest.approx(rest - slow.seconds / 2)
     slow.seconds = 2 * LIGHTS_S
     slow.measured.lights("cam_2")
     second = slow.said[-1]
     assert second["doing"] == "rendering camera 2 of 4"
     assert second["left_s"] == pytest.approx(LIGHTS_S)
-    sweep = COMPILE_S["sweep"] + 2 * SWEEP_S
+    sweep = SWEEP.first + 2 * SWEEP_S
     assert second["frame_s"]["tracking"] == pytest.approx(2 * sweep), "two cameras a lane"
     assert slow.measured.busy("cam_2") == {}, "its frame is ready"
 
@@ -70,7 +71,7 @@ def test_the_rest_of_a_lane_is_predicted_by_the_calls_that_were_measured(slow):
 def test_a_kind_is_predicted_by_its_own_calls(slow):
     slow.seconds = 100.0
     slow.measured.lights("cam_0")
-    slow.seconds = COMPILE_S["sweep"] + SWEEP_S
+    slow.seconds = SWEEP.first + SWEEP_S
     slow.measured.sweep("cam_1", 3)
     slow.seconds = SWEEP_S
     slow.measured.sweep("cam_3", 3)
