@@ -32,7 +32,7 @@ class DemoKind:
 FULL = DemoKind(
     "full",
     {"assess": {"turning_frames": 36}},
-    787.0,
+    850.0,
     {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"},
 )
 LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 80, 24, 24
@@ -49,8 +49,8 @@ QUICK = DemoKind(
         "assess": {"cameras": 1, "lights": 2, "spp": 8, "relit_size": 256, "relit_spp": 8},
         "baselines": False,
     },
-    50.0,
-    {"reconstruct": 18, "fit": 10, "relight": 4, "assess": 7, "evaluate": 11, "results": 1},
+    42.0,
+    {"reconstruct": 22, "fit": 11, "relight": 6, "assess": 7, "evaluate": 13, "results": 1},
     f"quick demo: {_SIZE}; figures are not those of the full demo",
     ("--spp", "8"),
 )
