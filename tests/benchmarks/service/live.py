@@ -99,8 +99,15 @@ class Live:
         self.child.wait(HURRY_S)
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """The answer's JSON. Raises where it is none of success."""
-        return self.http.request(method, path, json=body).raise_for_status().json()
+        """The response's JSON; after a 503 the request is sent once more, as its header says.
+
+        Raises `httpx.HTTPStatusError`.
+        """
+        response = self.http.request(method, path, json=body)
+        if response.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+            time.sleep(float(response.headers.get("retry-after", 1)))
+            response = self.http.request(method, path, json=body)
+        return response.raise_for_status().json()
 
     def until_done(self, capture: str) -> dict[str, Any]:
         """The capture once it is done."""
