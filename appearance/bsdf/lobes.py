@@ -52,16 +52,17 @@ class Fibre:
 class Known:
     """Quantities of a fibre and the known direction `wi`, for all lobes.
 
-    `sine`, `cosine` of the tilted inclination, `v` and `attenuation` A_p are one per lobe;
-    `choice` the probabilities of sampling each, summing to 1; `turn` is gamma_o + gamma_i in the
-    middle of R, TT and TRT; `direction` makes a vector of the type of `wi`.
+    `sine`, `cosine` of the tilted inclination, `m` (`Longitudinal`) and `attenuation` A_p are one
+    per lobe; `choice` the probabilities of sampling each, summing to 1; `n` (`Azimuthal`) is that
+    of all lobes; `turn` is gamma_o + gamma_i in the middle of R, TT and TRT; `direction` makes a
+    vector of the type of `wi`.
     """
 
     gamma: Any
     sine: Sequence[Any]
     cosine: Sequence[Any]
-    v: Sequence[Any]
-    s: Any
+    m: Sequence[Longitudinal]
+    n: Azimuthal
     turn: Sequence[Any]
     attenuation: Sequence[Any]
     choice: Sequence[Any]
@@ -109,18 +110,45 @@ def one_minus_exp(x: Any) -> Any:
     return dr.tanh(0.5 * x) * (1 + dr.exp(-x))
 
 
-def m_p(sine_i: Any, cosine_i: Any, sine_o: Any, cosine_o: Any, v: Any) -> Any:
-    """M_p, from sines and cosines of the inclinations."""
-    chord = (cosine_i - cosine_o) ** 2 + (sine_i + sine_o) ** 2
-    r = dr.rcp(v)
-    return scaled_i0(cosine_i * cosine_o * r) * dr.exp(-0.5 * chord * r) * r / one_minus_exp(2 * r)
+@dataclass(frozen=True)
+class Longitudinal:
+    """M_p of the variance `v`; made once for many directions."""
+
+    v: Any
+    rate: Any
+    scale: Any
+
+    @classmethod
+    def of(cls, v: Any) -> Longitudinal:
+        """M_p of `v`."""
+        r = dr.rcp(v)
+        return cls(v, r, r / one_minus_exp(2 * r))
+
+    def at(self, sine_i: Any, cosine_i: Any, sine_o: Any, cosine_o: Any) -> Any:
+        """M_p, from sines and cosines of the inclinations."""
+        chord = (cosine_i - cosine_o) ** 2 + (sine_i + sine_o) ** 2
+        r = self.rate
+        return scaled_i0(cosine_i * cosine_o * r) * dr.exp(-0.5 * chord * r) * self.scale
 
 
-def n_p(x: Any, s: Any) -> Any:
-    """N_p of R, TT and TRT at the azimuth `x` from the lobe's middle, of any period."""
-    x = x - 2 * pi * dr.round(x * (0.5 / pi))
-    z = dr.exp(-dr.abs(x) / s)
-    return z / (s * (1 + z) ** 2 * dr.tanh(0.5 * pi / s))
+@dataclass(frozen=True)
+class Azimuthal:
+    """N_p of R, TT and TRT for the scale `s` of the logistic; made once for many directions."""
+
+    s: Any
+    rate: Any
+    scale: Any
+
+    @classmethod
+    def of(cls, s: Any) -> Azimuthal:
+        """N_p of `s`."""
+        return cls(s, dr.rcp(s), dr.rcp(s * dr.tanh(0.5 * pi / s)))
+
+    def at(self, x: Any) -> Any:
+        """N_p at the azimuth `x` from the lobe's middle, of any period."""
+        x = x - 2 * pi * dr.round(x * (0.5 / pi))
+        z = dr.exp(-dr.abs(x) * self.rate)
+        return z * self.scale / (1 + z) ** 2
 
 
 def fresnel(mu: Any, eta: Any) -> tuple[Any, Any]:
@@ -167,8 +195,8 @@ def known(fibre: Fibre, wi: Any) -> Known:
         gamma,
         sines,
         cosines,
-        variances(fibre.beta_m),
-        logistic_scale(fibre.beta_n),
+        [Longitudinal.of(v) for v in variances(fibre.beta_m)],
+        Azimuthal.of(logistic_scale(fibre.beta_n)),
         (0.0, 2 * gamma_t + pi, 4 * gamma_t),
         attenuation,
         [m * total for m in mean],
@@ -183,10 +211,20 @@ def lobe(k: Known, p: int, wo: Any) -> Any:
 
 
 def _lobe(k: Known, p: int, sine: Any, cosine: Any, gamma: Any) -> Any:
-    m = m_p(k.sine[p], k.cosine[p], sine, cosine, k.v[p])
+    m = k.m[p].at(k.sine[p], k.cosine[p], sine, cosine)
     if p == LOBES - 1:
         return m * (0.5 / pi)
-    return m * n_p(gamma + k.gamma - k.turn[p], k.s)
+    return m * k.n.at(gamma + k.gamma - k.turn[p])
+
+
+def value_known(k: Known, wo: Any) -> Any:
+    """BSDF times cosine towards `wo`; per steradian."""
+    cosine, _, _ = across(wo)
+    gamma = azimuth(wo)
+    value: Any = 0.0
+    for p in range(LOBES):
+        value = value + k.attenuation[p] * _lobe(k, p, wo.y, cosine, gamma)
+    return value
 
 
 def evaluate_known(k: Known, wo: Any) -> tuple[Any, Any]:
@@ -219,7 +257,7 @@ def sample(fibre: Fibre, wi: Any, u1: Any, u2: Any, u3: Any) -> tuple[Any, Any, 
     """
     k = known(fibre, wi)
     past, u = choose(k.choice, u1)
-    m = (pick(past, k.sine), pick(past, k.cosine), pick(past, k.v))
+    m = (pick(past, k.sine), pick(past, k.cosine), pick(past, [m.v for m in k.m]))
     wo = _draw(k, m, pick(past, (*k.turn, 0.0)), past[-1], (u, u2, u3))
     value, pdf = evaluate_known(k, wo)
     return wo, pdf, value / pdf
@@ -229,7 +267,7 @@ def sample_lobe(k: Known, p: int, u1: Any, u2: Any, u3: Any) -> Any:
     """A direction of lobe `p` alone, of density `lobe`."""
     last = p == LOBES - 1
     turn = 0.0 if last else k.turn[p]
-    return _draw(k, (k.sine[p], k.cosine[p], k.v[p]), turn, last, (u1, u2, u3))
+    return _draw(k, (k.sine[p], k.cosine[p], k.m[p].v), turn, last, (u1, u2, u3))
 
 
 def choose(choice: Sequence[Any], u: Any) -> tuple[list[Any], Any]:
@@ -287,5 +325,5 @@ def _draw(k: Known, m: tuple[Any, Any, Any], turn: Any, last: Any, u: tuple[Any,
     out = (1 - below) * cosine + spread * c3 * sine
     along = spread * c3 * cosine - (1 - below) * sine
     flat = dr.sqrt(out * out + (spread * s3) ** 2)
-    gamma = turn - k.gamma + dr.select(last, pi * (2 * u[0] - 1), logistic_sample(u[0], k.s))
+    gamma = turn - k.gamma + dr.select(last, pi * (2 * u[0] - 1), logistic_sample(u[0], k.n.s))
     return k.direction(-flat * dr.sin(gamma), along, flat * dr.cos(gamma))

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.absorption import of_melanin
-from appearance.bsdf.far_field import LEAST_BETA_N, FarField
+from appearance.bsdf.far_field import LEAST_BETA_M, LEAST_BETA_N, FarField
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
@@ -79,10 +79,11 @@ class HairParameters:
         if self._turns or any(varies):
             return None
         fibre = self.fibre(StrandHit({}, None, None))
-        one = (fibre.beta_m, fibre.beta_n, fibre.eta)
+        one = (fibre.beta_m, fibre.beta_n, fibre.eta, dr.rad2deg(fibre.tilt))
         r, g, b, *rest = (float(x[0]) for x in (*fibre.sigma_a, *one))
         hair = HairAppearance((r, g, b), *rest)
-        return FarField(hair) if hair.beta_n >= LEAST_BETA_N else None
+        smooth = hair.beta_m >= LEAST_BETA_M and hair.beta_n >= LEAST_BETA_N
+        return FarField(hair) if smooth else None
 
     def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""

@@ -19,13 +19,13 @@ nearest counts. d: differentiable. A table that is the same everywhere costs no 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from appearance.bsdf.lobes import evaluate, sample
+from appearance.bsdf.lobes import evaluate, known, sample, value_known
 from appearance.bsdf.parameters import HairParameters, StrandHit
 
 
@@ -73,14 +73,19 @@ def plugin() -> Any:
             value, pdf = evaluate(fibre, frame.enter(si.wi), frame.enter(wo))
             return dr.select(active, mi.Color3f(value), 0), dr.select(active, pdf, 0)
 
-        def eval_mean(self, si: Any, wo: Any, active: Any) -> Any:
-            """`eval` averaged over half of the width (`FarField`); itself where the hair varies."""
-            far_field = self.parameters.far_field
-            if far_field is None:
-                return self.eval(mi.BSDFContext(), si, wo, active)
+        def towards(self, si: Any, active: Any, mean_width: bool) -> Callable[[Any, Any], Any]:
+            """`eval` of `si` towards `(wo, active)`; what does not depend on `wo` is computed once.
+
+            With `mean_width` averaged over parts of the width (`FarField`), where the hair is
+            uniform.
+            """
             fibre, frame = self._at(si, active)
-            value = far_field.evaluate(fibre, frame.enter(si.wi), frame.enter(wo), active)
-            return dr.select(active, value, 0)
+            wi = frame.enter(si.wi)
+            if mean_width and self.parameters.far_field is not None:
+                mean = self.parameters.far_field.towards(wi)
+                return lambda wo, active: mean(frame.enter(wo), active)
+            k = known(fibre, wi)
+            return lambda wo, active: mi.Color3f(value_known(k, frame.enter(wo)))
 
         def to_string(self) -> str:
             return f"extended_hair[{', '.join(self.parameters.values)}]"

@@ -243,6 +243,7 @@ class _Drawing:
         total, slots = opaque_index(len(self.lights)), opaque_index(len(self.pixels.index))
         (dim,) = opaque(self.sampling.dim)
         slot, lane = v.path % slots, dr.arange(mi.UInt32, len(v.number))
+        scattered = self.surface.towards(v.si, v.valid)
 
         def more(light: Any, rng: Any) -> Any:
             return v.valid & (light < total)
@@ -252,7 +253,7 @@ class _Drawing:
             towards = target - v.si.p
             squared = dr.squared_norm(towards)
             wo = v.si.to_local(towards * dr.rsqrt(squared))
-            value = self.surface.eval(v.si, wo, v.valid)
+            value = scattered(wo, v.valid)
             counts = dr.gather(mi.Float, importance, light * slots + slot, v.valid)
             bright = dr.max(v.throughput * value * intensity) * counts / squared
             chance = dr.minimum(1, bright / dim)

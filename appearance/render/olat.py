@@ -15,7 +15,14 @@ from pydantic import Field
 from appearance.render.bounces import bounce_limit
 from appearance.render.coverage import covered_pixels
 from appearance.render.lights import PackedLights
-from appearance.render.paths import PointSource, Surface, light_from, pixel_indices
+from appearance.render.paths import (
+    PointSource,
+    Surface,
+    light_from,
+    pixel_indices,
+    stream_of,
+    unshadowed,
+)
 from appearance.render.pixel_field import field_of
 from appearance.render.tracing import (
     PathLimits,
@@ -35,8 +42,12 @@ from reconstruction.options import Count, options
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many
 _PILOT_STREAM = 1 << 31
+PIXELS = 0.5
+"""Largest width of fibres, in pixels, that are scattered by their mean."""
 FILM_BYTES = 3 * 12
 """Of a pixel under a light: the film, its copy and the mean."""
+_BLOCK = 32
+"""Lights of which a vertex chooses those that cast a shadow ray: the bits of an integer."""
 _USUAL = 0.99  # quantile of the pilot's pixels beyond which a path is a rare bright one
 
 
@@ -87,6 +98,31 @@ def render_olat(
     return out if pixels is not None else spread_out(out, index, camera)
 
 
+def render_direct(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    pixels: ArrayLike,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Floats:
+    """Direct light of `render_olat`, `(L, P, 3)`, without the scene's field.
+
+    Uniform fibres that are thinner than a pixel have the BSDF's mean over parts of their width,
+    which has a quarter of the variance.
+    """
+    view = _View(scene, camera, lights, pixel_indices(camera, pixels))
+    thin = fibres_are_thin(scene, camera)
+    return _rendered(view, OlatOptions(max_depth=1, **options), seed, mean_width=thin)
+
+
+def fibres_are_thin(scene: HairScene, camera: Camera) -> bool:
+    """Whether `render_direct` scatters fibres by the mean over parts of their width."""
+    far_field = getattr(getattr(scene.hair_bsdf, "parameters", None), "far_field", None)
+    return far_field is not None and scene.fibre_width <= PIXELS * scene.footprint(camera)
+
+
 def render_indirect(
     scene: HairScene,
     camera: Camera,
@@ -98,11 +134,11 @@ def render_indirect(
 ) -> Floats:
     """Indirect light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    Fibres behind the first have the BSDF's mean over half of their width, which halves the variance
-    on uniform hair. Other hair has the BSDF of `render_olat`.
+    Uniform fibres have the BSDF's mean over parts of their width, which halves the variance. Other
+    hair has the BSDF of `render_olat`.
     """
     view = _View(scene, camera, lights, pixel_indices(camera, pixels))
-    return _rendered(view, OlatOptions(**options), seed, indirect=True)
+    return _rendered(view, OlatOptions(**options), seed, indirect=True, mean_width=True)
 
 
 def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
@@ -121,12 +157,19 @@ class _View(NamedTuple):
     pixels: Ints
 
 
-def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = False) -> Floats:
+def _rendered(
+    view: _View,
+    options: OlatOptions,
+    seed: int,
+    *,
+    indirect: bool = False,
+    mean_width: bool = False,
+) -> Floats:
     """`(L, P, 3)`: all light, or without that of the first vertices."""
     index, count, camera = view.pixels, len(view.lights), view.camera
     out = np.zeros((count, len(index), 3), np.float32)
     if out.size:
-        plan = _plan(view, options, seed, indirect)
+        plan = _plan(view, options, seed, indirect, mean_width)
         # each tile is spread over the whole image
         tiles = tile_count(index, FILM_BYTES * count, options.memory)
         for k in range(tiles):
@@ -149,7 +192,7 @@ class _Plan:
 
     `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
     this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the
-    light of first vertices.
+    light of first vertices; for `mean_width` see `Surface`.
     """
 
     scene: HairScene
@@ -159,12 +202,13 @@ class _Plan:
     limits: PathLimits
     dim: Floats
     indirect: bool
+    mean_width: bool
 
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> Floats:
         """Mean over `spp` paths a pixel: `(L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
         film = dr.zeros(mi.Float, 3 * count * len(index))
-        surface = Surface(self.scene, mean_width=self.indirect)
+        surface = Surface(self.scene, mean_width=self.mean_width)
         bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
         gather = _Gather(surface, film, slots, bank, dim, self.counts, self.indirect)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
@@ -191,13 +235,14 @@ class _Plan:
         return np.asarray(np.sqrt(squares.mean(1) / 2), np.float32)
 
 
-def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:
+def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool, mean_width: bool) -> _Plan:
     scene, camera, lights, index = view
     wanted = (options.first_lights, options.deep_lights)
     first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
     depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none, indirect)
+    limits = PathLimits(depth)
+    plan = _Plan(scene, camera, lights, (first, deep), limits, none, indirect, mean_width)
     if options.thrift > 0:
         spread = plan.spread(index, options.spp, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
@@ -227,19 +272,49 @@ class _Gather:
         stride = mi.Float(total) / mi.Float(count)
         sampled = min(self.counts) < self.bank.count
         start = paths.rng.next_float32() * stride if sampled else mi.Float(0)
+        word = mi.UInt64(paths.rng.next_uint32())
+        throughput, towards = paths.throughput * stride, self.surface.towards(si, active)
 
-        def more(j: Any, rng: Any) -> Any:
-            return active & (j < count)
+        def scattered(wo: Any, active: Any) -> Any:
+            return throughput * towards(wo, active)
 
-        def body(j: Any, rng: Any) -> Any:
+        def source(j: Any, active: Any) -> tuple[Any, PointSource]:
             light = j
             if sampled:
                 light = dr.minimum(mi.UInt32(mi.Float(j) * stride + start), total - 1)
+            rng = stream_of(word, mi.UInt64(light))  # the same point of the light each time
             target, intensity = self.bank.sample(light, si.p, rng, active)
-            source = PointSource(target, intensity, dr.gather(mi.Float, self.dim, light, active))
-            throughput, chance = paths.throughput * stride, rng.next_float32()
-            value, lit = light_from(self.surface, si, throughput, source, chance, active)
-            add_light(self.film, value, light * 3 * self.slots + slot, lit, self.slots)
-            return j + 1, rng
+            return light, PointSource(
+                target, intensity, dr.gather(mi.Float, self.dim, light, active)
+            )
 
-        dr.while_loop((mi.UInt32(0), paths.rng), more, body, label="lights of a vertex")
+        def block(first: Any, rng: Any) -> Any:
+            def choose(j: Any, cast: Any, rng: Any) -> Any:
+                _, light = source(first + j, active)
+                _, lit = unshadowed(si, scattered, light, rng.next_float32(), active)
+                return j + 1, cast | dr.select(lit, mi.UInt32(1) << j, 0), rng
+
+            end = dr.minimum(count - first, _BLOCK)
+            _, cast, rng = dr.while_loop(
+                (mi.UInt32(0), mi.UInt32(0), rng),
+                lambda j, cast, rng: active & (j < end),
+                choose,
+                label="lights that cast a shadow ray",
+            )
+
+            def shine(cast: Any) -> Any:
+                lit = cast != 0
+                number, light = source(first + dr.tzcnt(cast), lit)
+                value, lit = light_from(self.surface.scene, si, scattered, light, mi.Float(0), lit)
+                add_light(self.film, value, number * 3 * self.slots + slot, lit, self.slots)
+                return (cast & (cast - 1),)
+
+            dr.while_loop((cast,), lambda cast: cast != 0, shine, label="shadow rays")
+            return first + _BLOCK, rng
+
+        dr.while_loop(
+            (mi.UInt32(0), paths.rng),
+            lambda first, rng: active & (first < count),
+            block,
+            label="lights of a vertex",
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -73,16 +74,25 @@ class Surface:
 
     def eval(self, si: Any, wo: Any, active: Any) -> Any:
         """BSDF times cosine `Color3f` towards the local direction `wo`."""
+        return self.towards(si, active)(wo, active)
+
+    def towards(self, si: Any, active: Any) -> Callable[[Any, Any], Any]:
+        """`eval` of `si` as a function of `(wo, active)`, for many directions."""
         hair = self.is_hair(si)
-        value = self._diffuse(hair) * self._cosine(si, wo, hair) * dr.inv_pi
-        if self.scene.hair_bsdf is not None:
-            bsdf = self.scene.hair_bsdf
-            if self.mean_width and hasattr(bsdf, "eval_mean"):
-                fibre = bsdf.eval_mean(si, wo, active & hair)
-            else:
-                fibre = bsdf.eval(mi.BSDFContext(), si, wo, active & hair)
-            value = dr.select(hair, fibre, value)
-        return dr.select(active, value, 0)
+        albedo, bsdf = self._diffuse(hair) * dr.inv_pi, self.scene.hair_bsdf
+        fibre = None
+        if hasattr(bsdf, "towards"):
+            fibre = bsdf.towards(si, active & hair, self.mean_width)
+        elif bsdf is not None:
+            fibre = partial(bsdf.eval, mi.BSDFContext(), si)
+
+        def value(wo: Any, active: Any) -> Any:
+            diffuse = albedo * self._cosine(si, wo, hair)
+            if fibre is None:
+                return dr.select(active, diffuse, 0)
+            return dr.select(active, dr.select(hair, fibre(wo, active & hair), diffuse), 0)
+
+        return value
 
     def sample(self, si: Any, u1: Any, u2: Any, active: Any) -> tuple[Any, Any]:
         """A local direction and its weight (BSDF times cosine over density)."""
@@ -122,22 +132,34 @@ class PointSource:
 
 
 def light_from(
-    surface: Surface, si: Any, throughput: Any, source: PointSource, chance: Any, active: Any
+    scene: HairScene,
+    si: Any,
+    scattered: Callable[[Any, Any], Any],
+    source: PointSource,
+    chance: Any,
+    active: Any,
 ) -> tuple[Any, Any]:
     """Radiance `Color3f` that `source` sends along the path, and where it arrives.
 
-    `chance` in [0, 1) decides about the shadow rays of dim contributions.
+    `scattered(wo, active)` is the path's throughput times `Surface.towards` of `si`. `chance` in
+    [0, 1) decides about the shadow rays of dim contributions.
     """
+    value, lit = unshadowed(si, scattered, source, chance, active)
+    return value, lit & ~scene.occluded(si.spawn_ray_to(source.position), lit)
+
+
+def unshadowed(
+    si: Any, scattered: Callable[[Any, Any], Any], source: PointSource, chance: Any, active: Any
+) -> tuple[Any, Any]:
+    """`light_from` without the shadow ray, and where one is to be cast."""
     towards = source.position - si.p
     squared = dr.squared_norm(towards)
     wo = si.to_local(towards * dr.rsqrt(squared))
-    value = throughput * surface.eval(si, wo, active) * (source.intensity / squared)
+    value = scattered(wo, active) * (source.intensity / squared)
     brightest = dr.max(value)
     kept = dr.maximum(brightest, source.dim)
     chance = dr.maximum(chance, 1e-9)  # at 0 a contribution of 1e-40 would count as infinitely many
-    lit = active & (chance * kept < brightest)
-    lit &= ~surface.scene.occluded(si.spawn_ray_to(source.position), lit)
-    return value * (kept / brightest), lit
+    return value * (kept / brightest), active & (chance * kept < brightest)
 
 
 def pixel_indices(camera: Camera, pixels: ArrayLike) -> Ints:

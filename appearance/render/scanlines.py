@@ -190,7 +190,12 @@ class _Gather:
         (dim,) = opaque(self.dim)
         chance = paths.rng.next_float32()
         source = PointSource(centre, intensity, dim)
-        value, seen = light_from(self.surface, si, paths.throughput, source, chance, seen)
+        towards = self.surface.towards(si, seen)
+
+        def scattered(wo: Any, active: Any) -> Any:
+            return paths.throughput * towards(wo, active)
+
+        value, seen = light_from(self.surface.scene, si, scattered, source, chance, seen)
         self._splat(value, v, reach, paths.slot, seen)
 
     def _splat(self, value: Any, v: Any, reach: float, slot: Any, seen: Any) -> None:

@@ -21,6 +21,7 @@ BENCHMARKS = {
     "demo": "recorded demos over subjects and seeds compared with their baselines",
     "exports": "a model opened, rendered and written by Blender, compared with ours",
     "fields": "fields of reflectance compared with baselines on new lights and views",
+    "frames": "the simulated frames compared with many paths: error against run time",
     "importing": "strands of a capture written out as photographs, by damage",
     "interpolation": "captured frames interpolated on strands, standard and guided by a model",
     "large": "captures of 1.3 and 20 megapixels: seconds and memory compared with the estimate",

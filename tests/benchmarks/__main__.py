@@ -30,6 +30,7 @@ MODULES = {
     "demo": "benchmarks.demo",
     "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",
+    "frames": "benchmarks.renderers.frames",
     "importing": "benchmarks.importing.damages",
     "interpolation": "benchmarks.fields.interpolation",
     "large": "benchmarks.importing.large_sizes",

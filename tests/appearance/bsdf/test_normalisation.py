@@ -24,9 +24,9 @@ def test_longitudinal_lobes_integrate_to_one(beta_m, tilt_deg):
             nodes, weights = panels([-theta_p], [np.sqrt(v)], -np.pi / 2, np.pi / 2)
             weights = weights * np.cos(nodes)
             assert reference.m_p(theta_p, nodes, v) @ weights == pytest.approx(1, abs=1e-6)
-            ours = lobes.m_p(
+            ours = lobes.Longitudinal.of(each(v)).at(
                 *(each(np.sin(theta_p)), each(np.cos(theta_p))),
-                *(number(np.sin(nodes)), number(np.cos(nodes)), each(v)),
+                *(number(np.sin(nodes)), number(np.cos(nodes))),
             )
             assert np.array(ours) @ weights == pytest.approx(1, abs=1e-6)
 
@@ -42,7 +42,7 @@ def test_azimuthal_lobes_integrate_to_one(beta_n):
                 nodes, weights = panels([middle], [s], middle - np.pi, middle + np.pi)
                 got = reference.n_p(p, nodes, gamma, inner, s)
                 assert got @ weights == pytest.approx(1, abs=1e-6)
-                ours = lobes.n_p(number(nodes - middle), dr.opaque(number, s))
+                ours = lobes.Azimuthal.of(dr.opaque(number, s)).at(number(nodes - middle))
                 assert np.array(ours) @ weights == pytest.approx(1, abs=1e-6)
 
 

@@ -19,13 +19,11 @@ def arriving(brought: tuple[float, float, float], chance: float, dim: float = 1.
     si = SimpleNamespace(
         p=mi.Point3f(0, 0, 0), to_local=lambda v: mi.Vector3f(v), spawn_ray_to=lambda t: None
     )
-    surface = SimpleNamespace(
-        eval=lambda si, wo, active: mi.Color3f(1),
-        scene=SimpleNamespace(occluded=lambda ray, active: mi.Bool(False)),
-    )
+    scene = SimpleNamespace(occluded=lambda ray, active: mi.Bool(False))
     source = PointSource(mi.Point3f(0, 0, 1), mi.Color3f(1), mi.Float(dim))
-    throughput = mi.Color3f(*brought)
-    value, lit = light_from(surface, si, throughput, source, mi.Float(chance), mi.Bool(True))
+    value, lit = light_from(
+        scene, si, lambda wo, active: mi.Color3f(*brought), source, mi.Float(chance), mi.Bool(True)
+    )
     return np.array(value).ravel(), bool(np.array(lit).all())
 
 

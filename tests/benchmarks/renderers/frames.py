@@ -1,0 +1,173 @@
+"""The simulators' frames beside many paths: error against CPU time of the ways to render them.
+
+Judged on pixels of hair under held-out lights, as the demo judges pictures. Leaves `frames.json`
+and `frames.png`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from appearance import HairScene, Sampling, render_olat
+from appearance.metrics.scores import Exposure
+from appearance.render.coverage import covered_pixels
+from appearance.render.smoothed import olat_smoothed
+from benchmarks.command import SUBJECT, Benchmark, option
+from benchmarks.renderers.cost import hair_pixels
+from benchmarks.results import Panel, draw_panels, save
+from benchmarks.subjects import simulated
+from reconstruction import Camera, Light, Progress, Rig
+from reconstruction.arrays import Array, Floats, Ints
+
+PLAIN, SMOOTHED, CHOSEN = "render_olat", "olat_smoothed", "chosen"
+DEPTH = 16
+"""Vertices a path may have, as in the simulators."""
+SEEDS = option("--seeds", "how many", type=int, default=2)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Paths a pixel of each method, of the frames as `chosen`, and of what they are held against;
+    pixels and lights that are judged; a small picture's share of the camera's, that is timed."""
+
+    plain: Sequence[int] = (4, 16, 64)
+    smoothed: Sequence[int] = (4, 9, 16, 36)
+    chosen: int = 16
+    reference: int = 4096
+    pixels: int = 300
+    every_nth_light: int = 28
+    cameras: int = 8
+    timed: float = 0.2
+
+
+QUICK = Effort((2, 4), (2, 4), 4, 32, 30, 160, 1, 0.05)
+
+
+def methods(effort: Effort) -> dict[tuple[str, int], Callable[..., Floats]]:
+    """By name and paths: `(scene, camera, lights, pixels, seed)` to radiance `(L, P, 3)`."""
+
+    def plain(spp: int) -> Callable[..., Floats]:
+        return lambda scene, camera, lights, pixels, seed: render_olat(
+            scene, camera, lights, spp=spp, max_depth=DEPTH, seed=seed, pixels=pixels
+        )
+
+    def smooth(spp: int) -> Callable[..., Floats]:
+        return lambda scene, camera, lights, pixels, seed: olat_smoothed(
+            scene, camera, lights, Sampling(spp, DEPTH, seed), pixels=pixels
+        )
+
+    found = {(PLAIN, spp): plain(spp) for spp in effort.plain}
+    return found | {(SMOOTHED, spp): smooth(spp) for spp in effort.smoothed}
+
+
+def cost(scene: HairScene, camera: Camera, lights: Sequence[Light], effort: Effort) -> Array:
+    """CPU seconds of each method for all `lights` in a small picture, over plain 16 paths'.
+
+    The second call counts: the first compiles.
+    """
+    K = camera.K.copy()
+    K[:2] *= effort.timed
+    width, height = (max(int(effort.timed * n), 8) for n in (camera.width, camera.height))
+    small = replace(camera, K=K, width=width, height=height)
+    pixels = covered_pixels(scene, small)
+    seconds = []
+    for render in (methods(replace(effort, plain=(16,)))[PLAIN, 16], *methods(effort).values()):
+        for seed in (1, 2):
+            start = time.process_time()
+            render(scene, small, lights, pixels, seed)
+            spent = time.process_time() - start
+        seconds.append(spent)
+    return np.array(seconds[1:]) / seconds[0]
+
+
+def _reference(
+    scene: HairScene, camera: Camera, lights: Sequence[Light], pixels: Ints, spp: int
+) -> tuple[Floats, Floats]:
+    """Two independent halves of what frames are held against."""
+    one, other = (
+        render_olat(
+            scene, camera, lights, spp=spp // 2, max_depth=DEPTH, seed=1000 + k, pixels=pixels
+        )
+        for k in (0, 1)
+    )
+    return one, other
+
+
+def psnrs(image: Floats, truth: Floats, exposure: Exposure) -> list[float]:
+    """PSNR in dB of each of the pictures `(L, P, 3)` against `truth`, as pictures are shown."""
+    error = ((exposure(image) - exposure(truth)) ** 2).mean((1, 2))
+    return [float(x) for x in -10 * np.log10(np.maximum(error, 1e-10))]
+
+
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Each method's error by camera, light and seed, its mean over the reference's, and its cost.
+
+    The reference's own error, by its halves, is in the results too: no method gets below it.
+    """
+    effort = QUICK if args.quick else Effort()
+    rig = Rig.load(args.rig)
+    scene = simulated(args.rig, args.subject, args.head, args.seed).scene()
+    lights = rig.lights[effort.every_nth_light // 2 :: effort.every_nth_light]
+    cameras = rig.cameras[: effort.cameras]
+    pixels = [hair_pixels(scene, c, effort.pixels, 100 + k) for k, c in enumerate(cameras)]
+    halves = [
+        _reference(scene, c, lights, px, effort.reference)
+        for c, px in zip(cameras, pixels, strict=True)
+    ]
+    truth = [0.5 * (one + other) for one, other in halves]
+    exposure = Exposure.of(t.reshape(-1, 3) for t in truth)
+    # a half differs from the other by twice the error of their mean: 6 dB
+    own = [x + 6.02 for one, other in halves for x in psnrs(one, other, exposure)]
+    result: dict[str, Any] = {
+        "lights": len(lights),
+        "cameras": len(cameras),
+        "reference": {"spp": effort.reference, **_summary(own)},
+        "series": [],
+    }
+    costs = cost(scene, cameras[0], rig.lights, effort)
+    for k, ((name, spp), render) in enumerate(methods(effort).items()):
+        progress(f"{name}, {spp} paths", k / len(costs))
+        found, means = list[float](), []
+        for seed in range(args.seed, args.seed + args.seeds):
+            for camera, px, true in zip(cameras, pixels, truth, strict=True):
+                image = render(scene, camera, lights, px, seed)
+                found += psnrs(image, true, exposure)
+                means.append(image.mean() / true.mean())
+        result["series"].append(
+            {
+                "method": name,
+                "spp": spp,
+                "chosen": (name, spp) == (SMOOTHED, effort.chosen),
+                "cost": float(costs[k]),
+                **_summary(found),
+                "mean": float(np.mean(means)),
+                **({"mean_sd": float(np.std(means, ddof=1))} if len(means) > 1 else {}),
+            }
+        )
+        save(args.out / "frames.json", result)
+    draw_panels(args.out / "frames.png", [[_panel(result["series"])]])
+    return result
+
+
+def _summary(values: Sequence[float]) -> dict[str, float]:
+    median, low = np.percentile(values, (50, 5))
+    return {"median_db": float(median), "fifth_percentile_db": float(low)}
+
+
+def _panel(series: Sequence[dict[str, Any]]) -> Panel:
+    curves = {
+        name: [(p["cost"], p["median_db"]) for p in series if p["method"] == name]
+        for name in (PLAIN, SMOOTHED)
+    }
+    curves[CHOSEN] = [(p["cost"], p["median_db"]) for p in series if p["chosen"]]
+    styles = {PLAIN: "k.-", SMOOTHED: "C0o-", CHOSEN: "C3*"}
+    return Panel("", curves, "CPU time over render_olat's at 16", "dB", ("log", "linear"), styles)
+
+
+BENCHMARK = Benchmark(run, (*SUBJECT, SEEDS))
