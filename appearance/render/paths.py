@@ -81,7 +81,7 @@ class Surface:
         hair = self.is_hair(si)
         albedo, bsdf = self._diffuse(hair) * dr.inv_pi, self.scene.hair_bsdf
         fibre = None
-        if hasattr(bsdf, "towards"):
+        if bsdf is not None and hasattr(bsdf, "towards"):
             fibre = bsdf.towards(si, active & hair, self.mean_width)
         elif bsdf is not None:
             fibre = partial(bsdf.eval, mi.BSDFContext(), si)

@@ -146,8 +146,8 @@ class _Load:
 
 def _capture(live: Live) -> float:
     """Seconds of a capture that nobody asks about until its end."""
-    capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
-    while (status := live.ask("GET", f"/captures/{capture}"))["state"] != "done":
+    capture = live.call("POST", "/captures", {"plan": PLAN})["id"]
+    while (status := live.call("GET", f"/captures/{capture}"))["state"] != "done":
         time.sleep(0.25)
     assert status["outcome"] == "completed", status
     return float(status["seconds"])
@@ -203,7 +203,7 @@ def _cell(live: Live, load: str, capture: str, token: str, pairs: int) -> dict[s
         with crowd:
             for number in range(BLACKOUTS):
                 for name, fault in FAULTS.items():
-                    live.ask("POST", "/captures", {"plan": PLAN})
+                    live.call("POST", "/captures", {"plan": PLAN})
                     time.sleep(0.5 + 0.2 * number)
                     blackouts[name].append(_blackout(live, fault))
                     _settle(live)
@@ -234,8 +234,8 @@ def _settle(live: Live) -> None:
     """Wait until nothing runs, and all is dark."""
     deadline = time.monotonic() + HURRY_S
     while True:
-        dark = live.ask("POST", "/devices/blackout")["state"] == "dark"
-        if dark and live.ask("GET", "/health")["capture"] is None:
+        dark = live.call("POST", "/devices/blackout")["state"] == "dark"
+        if dark and live.call("GET", "/health")["capture"] is None:
             return
         assert time.monotonic() < deadline, "it never came to rest"
         time.sleep(0.1)
@@ -264,7 +264,7 @@ def run(
             tokens = {
                 name: known.make(name, CALLERS[name]) if CALLERS[name] else "" for name in callers
             }
-            capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
+            capture = live.call("POST", "/captures", {"plan": PLAN})["id"]
             live.until_done(capture)
             for number, load in enumerate(loads):
                 for name in callers:

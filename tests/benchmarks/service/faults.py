@@ -81,12 +81,12 @@ def _black_out(live: Live, fault: str, load: str, strike: Strike) -> Cell:
     # A second service takes a while to start: the capture is to run when it asks for the stage.
     rate = 1.0 if fault == SECOND else RATE_HZ
     with LOADS[load](live):
-        capture = live.ask("POST", "/captures", {"plan": {**plan, "rate_hz": rate}})
-        while live.ask("GET", f"/captures/{capture['id']}")["frames_written"] < 5:
+        capture = live.call("POST", "/captures", {"plan": {**plan, "rate_hz": rate}})
+        while live.call("GET", f"/captures/{capture['id']}")["frames_written"] < 5:
             time.sleep(0.02)
         with strike(live):
             begin = time.monotonic()
-            state = live.ask("POST", "/devices/blackout")["state"]
+            state = live.call("POST", "/devices/blackout")["state"]
             seconds = time.monotonic() - begin
     return Cell(fault, load, seconds, state, *_finish(live, capture["id"], capture["path"]))
 
@@ -111,7 +111,7 @@ def _resume(live: Live, capture: str) -> None:
     again, or refuses captures, until it is over."""
     deadline = time.monotonic() + HURRY_S
     while True:
-        if live.ask("POST", "/devices/blackout")["state"] == "dark":
+        if live.call("POST", "/devices/blackout")["state"] == "dark":
             response = live.http.request("POST", f"/captures/{capture}/resume", json={})
             if response.status_code != httpx.codes.CONFLICT:
                 response.raise_for_status()
@@ -138,7 +138,7 @@ def _kill(
     plan = {"lights": LIGHTS[:10], "rows": {"last": 9}, "stepping": stepping}
     with LOADS[load](live):
         (folder / "signs" / "armed").touch()
-        capture = live.ask("POST", "/captures", {"plan": plan})
+        capture = live.call("POST", "/captures", {"plan": plan})
         deadline = time.monotonic() + HURRY_S
         while not (folder / "signs" / "here").exists():
             assert time.monotonic() < deadline, f"it never came to: {name}"
@@ -274,7 +274,7 @@ def _second(folder: Path) -> Iterator[tuple[list[str], Strike]]:
         command = [*_OWN, *live.words(folder / "second")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=HURRY_S, check=False)
         assert done.returncode, "the second service took the stage"
-        assert live.ask("GET", "/health")["capture"], "the capture had ended already"
+        assert live.call("GET", "/health")["capture"], "the capture had ended already"
         yield
 
     yield [], strike

@@ -98,7 +98,7 @@ class Live:
         self.child.terminate()
         self.child.wait(HURRY_S)
 
-    def ask(self, method: str, path: str, body: Any = None) -> Any:
+    def call(self, method: str, path: str, body: Any = None) -> Any:
         """The response's JSON; after a 503 the request is sent once more, as its header says.
 
         Raises `httpx.HTTPStatusError`.
@@ -111,7 +111,7 @@ class Live:
 
     def until_done(self, capture: str) -> dict[str, Any]:
         """The capture once it is done."""
-        while (status := self.ask("GET", f"/captures/{capture}"))["state"] != "done":
+        while (status := self.call("GET", f"/captures/{capture}"))["state"] != "done":
             time.sleep(0.1)
         done: dict[str, Any] = status
         return done

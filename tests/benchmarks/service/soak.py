@@ -87,7 +87,7 @@ def _monitored(
         for monitored in (True, False) if pair % 2 else (False, True):
             with console(live) if monitored else nullcontext():
                 time.sleep(1.0)
-                capture = live.ask("POST", "/captures", {"plan": PLAN})["id"]
+                capture = live.call("POST", "/captures", {"plan": PLAN})["id"]
                 took = _seconds(live, capture)
             if pair >= 0:
                 seconds[monitored].append(took)
@@ -104,9 +104,9 @@ def _monitored(
 
 def _seconds(live: Live, capture: str) -> float:
     """Seconds of a capture that is hardly asked about."""
-    while live.ask("GET", f"/captures/{capture}")["state"] != "done":
+    while live.call("GET", f"/captures/{capture}")["state"] != "done":
         time.sleep(1.0)
-    return float(live.ask("GET", f"/captures/{capture}")["seconds"])
+    return float(live.call("GET", f"/captures/{capture}")["seconds"])
 
 
 class _Worker:
@@ -149,19 +149,19 @@ def _shoot(
         elapsed_share = (time.monotonic() - begun) / (60 * minutes)
         summary = f"{live.kills} kills of the service, {worker.kills} of workers"
         progress(f"{len(known_ids)} captures, {summary}", 0.5 * elapsed_share)
-        queue = live.ask("GET", "/queue")
+        queue = live.call("GET", "/queue")
         if queue["held"]:
             _finish(live)
             _go_on(live)
         for _ in range(WAITING - len(queue["waiting"])):
-            live.ask("POST", "/queue", {"plan": PLAN})
-        going = live.ask("GET", "/health")["capture"]
+            live.call("POST", "/queue", {"plan": PLAN})
+        going = live.call("GET", "/health")["capture"]
         if going and going not in known_ids:
             known_ids.add(going)
             result["captures"].append({"id": going, "life": live.kills, **live.size()})
-            if before and live.ask("GET", f"/captures/{before}")["outcome"] == "completed":
+            if before and live.call("GET", f"/captures/{before}")["outcome"] == "completed":
                 job = {"capture": before, "pipeline": {"name": "reconstruct"}}
-                live.ask("POST", "/jobs", job)
+                live.call("POST", "/jobs", job)
             before = going
             if len(known_ids) % KILL_WORKER_EVERY == 0:
                 time.sleep(rng.uniform(0.0, 1.0))
@@ -197,7 +197,7 @@ def _jobs(live: Live) -> dict[str, int]:
     for job in _paged(live, "jobs"):
         while job["state"] != "done":
             time.sleep(0.5)
-            job = live.ask("GET", f"/jobs/{job['id']}")
+            job = live.call("GET", f"/jobs/{job['id']}")
         outcomes[job["outcome"]] = outcomes.get(job["outcome"], 0) + 1
         lines = (Path(job["model"]) / "log.txt").read_text().splitlines()
         again += sum(line.startswith("begins") for line in lines) - 2
@@ -208,7 +208,7 @@ def _paged(live: Live, kind: str) -> Iterator[dict[str, Any]]:
     """All captures or jobs."""
     page = 1000
     for offset in itertools.count(0, page):
-        found = live.ask("GET", f"/{kind}?limit={page}&offset={offset}")
+        found = live.call("GET", f"/{kind}?limit={page}&offset={offset}")
         yield from found
         if len(found) < page:
             break
@@ -216,18 +216,18 @@ def _paged(live: Live, kind: str) -> Iterator[dict[str, Any]]:
 
 def _finish(live: Live) -> None:
     """Let what a kill interrupted shoot what it lacks."""
-    for capture in live.ask("GET", "/captures"):
+    for capture in live.call("GET", "/captures"):
         if capture["outcome"] == "interrupted":
-            live.ask("POST", f"/captures/{capture['id']}/resume", {})
+            live.call("POST", f"/captures/{capture['id']}/resume", {})
             live.until_done(capture["id"])
 
 
 def _empty(live: Live) -> None:
     """Take out what waits, and let what runs end."""
-    live.ask("POST", "/queue:hold")
-    for entry in live.ask("GET", "/queue")["waiting"]:
-        live.ask("DELETE", f"/queue/{entry['id']}")
-    if going := live.ask("GET", "/health")["capture"]:
+    live.call("POST", "/queue:hold")
+    for entry in live.call("GET", "/queue")["waiting"]:
+        live.call("DELETE", f"/queue/{entry['id']}")
+    if going := live.call("GET", "/health")["capture"]:
         live.until_done(going)
     _finish(live)
     _go_on(live)
@@ -235,8 +235,8 @@ def _empty(live: Live) -> None:
 
 def _go_on(live: Live) -> None:
     """Say that the queue may go on, whatever it was held for."""
-    if (hold := live.ask("GET", "/queue")["hold"]) is not None:
-        live.ask("POST", "/queue:go-on", {"hold": hold["id"]})
+    if (hold := live.call("GET", "/queue")["hold"]) is not None:
+        live.call("POST", "/queue:go-on", {"hold": hold["id"]})
 
 
 def _judge(live: Live) -> dict[str, Any]:
