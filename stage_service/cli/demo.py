@@ -138,7 +138,7 @@ def _capture(
         "environment": args.environment,
         "seed": args.seed,
         "truth": str(truth),
-        "label": kind.label,
+        **({"label": kind.label} if kind.label else {}),
         **kind.options,
     }
     body: dict[str, Any] = {"plan": {}, "pipeline": {"name": kind.pipeline, "options": options}}

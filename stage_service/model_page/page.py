@@ -55,8 +55,7 @@ def write_page(model: Model, label: str = "") -> Path:
 
 
 def model_page(model: Model, label: str = "") -> Html:
-    """The page of `model`, with or without strands; `label` stands under its name, by default that
-    of its results."""
+    """The page of `model`; `label` stands under its name, by default that of its results."""
     report = model.report()
     results = model.json("results.json") if model.has("results.json") else {}
     label = label or results.get("label", "")
