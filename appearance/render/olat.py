@@ -42,8 +42,6 @@ from reconstruction.options import Count, options
 _PILOT = 512  # pixels of the pilot passes at most
 _PILOT_SHARE = 64  # and one path in so many
 _PILOT_STREAM = 1 << 31
-PIXELS = 0.5
-"""Largest width of fibres, in pixels, that are scattered by their mean."""
 FILM_BYTES = 3 * 12
 """Of a pixel under a light: the film, its copy and the mean."""
 _BLOCK = 32
@@ -98,31 +96,6 @@ def render_olat(
     return out if pixels is not None else spread_out(out, index, camera)
 
 
-def render_direct(
-    scene: HairScene,
-    camera: Camera,
-    lights: Sequence[Light],
-    pixels: ArrayLike,
-    *,
-    seed: int = 0,
-    **options: Any,
-) -> Floats:
-    """Direct light of `render_olat`, `(L, P, 3)`, without the scene's field.
-
-    Uniform fibres that are thinner than a pixel have the BSDF's mean over parts of their width,
-    which has a quarter of the variance.
-    """
-    view = _View(scene, camera, lights, pixel_indices(camera, pixels))
-    thin = fibres_are_thin(scene, camera)
-    return _rendered(view, OlatOptions(max_depth=1, **options), seed, mean_width=thin)
-
-
-def fibres_are_thin(scene: HairScene, camera: Camera) -> bool:
-    """Whether `render_direct` scatters fibres by the mean over parts of their width."""
-    far_field = getattr(getattr(scene.hair_bsdf, "parameters", None), "far_field", None)
-    return far_field is not None and scene.fibre_width <= PIXELS * scene.footprint(camera)
-
-
 def render_indirect(
     scene: HairScene,
     camera: Camera,
@@ -138,7 +111,7 @@ def render_indirect(
     hair has the BSDF of `render_olat`.
     """
     view = _View(scene, camera, lights, pixel_indices(camera, pixels))
-    return _rendered(view, OlatOptions(**options), seed, indirect=True, mean_width=True)
+    return _rendered(view, OlatOptions(**options), seed, indirect=True)
 
 
 def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
@@ -157,19 +130,12 @@ class _View(NamedTuple):
     pixels: Ints
 
 
-def _rendered(
-    view: _View,
-    options: OlatOptions,
-    seed: int,
-    *,
-    indirect: bool = False,
-    mean_width: bool = False,
-) -> Floats:
+def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = False) -> Floats:
     """`(L, P, 3)`: all light, or without that of the first vertices."""
     index, count, camera = view.pixels, len(view.lights), view.camera
     out = np.zeros((count, len(index), 3), np.float32)
     if out.size:
-        plan = _plan(view, options, seed, indirect, mean_width)
+        plan = _plan(view, options, seed, indirect)
         # each tile is spread over the whole image
         tiles = tile_count(index, FILM_BYTES * count, options.memory)
         for k in range(tiles):
@@ -192,7 +158,7 @@ class _Plan:
 
     `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
     this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the
-    light of first vertices; for `mean_width` see `Surface`.
+    light of first vertices.
     """
 
     scene: HairScene
@@ -202,13 +168,12 @@ class _Plan:
     limits: PathLimits
     dim: Floats
     indirect: bool
-    mean_width: bool
 
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> Floats:
         """Mean over `spp` paths a pixel: `(L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
         film = dr.zeros(mi.Float, 3 * count * len(index))
-        surface = Surface(self.scene, mean_width=self.mean_width)
+        surface = Surface(self.scene, mean_width=self.indirect)
         bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
         gather = _Gather(surface, film, slots, bank, dim, self.counts, self.indirect)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
@@ -235,14 +200,13 @@ class _Plan:
         return np.asarray(np.sqrt(squares.mean(1) / 2), np.float32)
 
 
-def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool, mean_width: bool) -> _Plan:
+def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:
     scene, camera, lights, index = view
     wanted = (options.first_lights, options.deep_lights)
     first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
     depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    limits = PathLimits(depth)
-    plan = _Plan(scene, camera, lights, (first, deep), limits, none, indirect, mean_width)
+    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none, indirect)
     if options.thrift > 0:
         spread = plan.spread(index, options.spp, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
@@ -272,7 +236,8 @@ class _Gather:
         stride = mi.Float(total) / mi.Float(count)
         sampled = min(self.counts) < self.bank.count
         start = paths.rng.next_float32() * stride if sampled else mi.Float(0)
-        word = mi.UInt64(paths.rng.next_uint32())
+        extended = self.bank.radii is not None or self.bank.sizes is not None
+        word = mi.UInt64(paths.rng.next_uint32()) if extended else mi.UInt64(0)
         throughput, towards = paths.throughput * stride, self.surface.towards(si, active)
 
         def scattered(wo: Any, active: Any) -> Any:

@@ -42,7 +42,6 @@ class HairScene:
 
     `mi_scene` is a `mitsuba.Scene` without emitters or sensors, in centimetres. `hair_bsdf` is a
     `mitsuba.BSDF`, or None for `DiffuseHair`. `with_hair` and `with_skin` share the geometry.
-    `fibre_width` is the fibres' mean diameter and `middle` the mean of their points, in metres.
     `field` is a reflectance field, used by `render_olat`, `render_environment`, `render_mixed` and
     the smoothed images, not by gradients and scanlines.
     """
@@ -53,14 +52,7 @@ class HairScene:
     hair: HairAppearance | DiffuseHair
     skin: tuple[float, float, float]
     hair_bsdf: Any | None
-    fibre_width: float = 0.0
-    middle: tuple[float, float, float] = (0.0, 0.0, 0.0)
     field: SceneField | None = None
-
-    def footprint(self, camera: Camera) -> float:
-        """Width in metres of a pixel of `camera` at the middle of the hair."""
-        depth = float(np.linalg.norm(camera.center - self.middle))
-        return depth / float(camera.K[0, 0])
 
     def occluded(self, ray: Any, active: Any = True) -> Any:
         """Whether `ray` meets anything before its end.
@@ -109,19 +101,7 @@ def build_scene(
         parts["hair"] = hair_shape
     if head_shape is not None:
         parts["head"] = head_shape
-    width, middle = 0.0, np.zeros(3)
-    if len(strands):
-        width, middle = 2 * float(np.mean(strands.radius)), strands.points.mean(0)
-    return HairScene(
-        mi.load_dict(parts),
-        hair_shape,
-        head_shape,
-        hair,
-        albedo,
-        _hair_bsdf(hair),
-        width,
-        (float(middle[0]), float(middle[1]), float(middle[2])),
-    )
+    return HairScene(mi.load_dict(parts), hair_shape, head_shape, hair, albedo, _hair_bsdf(hair))
 
 
 def mitsuba_hair(hair: HairAppearance, bsdf: str = "extended_hair") -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Quality:
     rows of a camera and pose; `together` paths are for one light vector.
     """
 
-    lights: int = 24
+    lights: int = 16
     sweep: int = 16
     together: int = 24
     depth: int = 16

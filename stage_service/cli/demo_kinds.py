@@ -32,7 +32,7 @@ class DemoKind:
 FULL = DemoKind(
     "full",
     {"assess": {"turning_frames": 36}},
-    850.0,
+    720.0,
     {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"},
 )
 LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 80, 24, 24
