@@ -45,7 +45,7 @@ def test_black_hair_is_found_darker_than_the_start(tufted):
 def test_white_hair_is_found_lighter_than_the_start(tufted):
     truth = HairAppearance((0.001, 0.002, 0.008), 0.25, 0.3)
     # light goes far in it: of few paths, one bright one decides whether the fit is taken
-    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
+    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=256))
     found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START), quiet)
     assert found.sigma_a.max() < 0.7 * START.sigma_a[0]
 
@@ -57,7 +57,7 @@ def test_a_roughness_that_starts_at_either_end(plain, tufted, beta_m):
 
 
 def test_one_light_and_one_view(tufted):
-    lone = tufted.problem(views=1, lights=tufted.dome(8)[:1], spp=256)
+    lone = tufted.problem(views=1, lights=tufted.dome(8)[:1], spp=1024)
     quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
     found = check(lone, HairMaps.of(START), quiet)
     assert (np.diff(found.sigma_a[0, 0, 0]) > 0).all(), "brown hair takes most of the blue"

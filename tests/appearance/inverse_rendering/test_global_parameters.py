@@ -52,7 +52,7 @@ def test_all_are_found_together(plain, tufted, start):
 )
 def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     truth = replace(tufted.truth, beta_m=beta_m, beta_n=beta_n)
-    problem = tufted.problem(HairMaps.of(truth), views=1, spp=512)
+    problem = tufted.problem(HairMaps.of(truth), views=1, spp=2048)
     quiet = replace(EFFORT, pixels=100, spp=256)
     _, _, maps, _, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3), effort=quiet)
     assert maps.beta_m == pytest.approx(beta_m, rel=0.2)

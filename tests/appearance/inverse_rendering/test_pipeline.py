@@ -40,7 +40,7 @@ from reconstruction import (
 REQUEST = parse_options(
     InverseRenderingRequest,
     {
-        "judged_spp": 16,
+        "judged_spp": 64,
         "max_depth": 5,
         "fit": {
             "variant": "lights",
