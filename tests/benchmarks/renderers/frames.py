@@ -81,8 +81,8 @@ def cost(scene: HairScene, camera: Camera, lights: Sequence[Light], effort: Effo
         for seed in (1, 2):
             start = time.process_time()
             render(scene, small, lights, pixels, seed)
-            spent = time.process_time() - start
-        seconds.append(spent)
+            cpu_s = time.process_time() - start
+        seconds.append(cpu_s)
     return np.array(seconds[1:]) / seconds[0]
 
 
