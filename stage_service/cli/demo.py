@@ -138,8 +138,7 @@ def _capture(
         "environment": args.environment,
         "seed": args.seed,
         "truth": str(truth),
-        **({"label": kind.label} if kind.label else {}),
-        **kind.options,
+        **kind.job_options,
     }
     body: dict[str, Any] = {"plan": {}, "pipeline": {"name": kind.pipeline, "options": options}}
     if (truth / "head.obj").is_file():

@@ -28,6 +28,11 @@ class DemoKind:
     label: str = ""
     simulator: tuple[str, ...] = ()
 
+    @property
+    def job_options(self) -> dict[str, Any]:
+        """The options with the label; a job takes no empty label."""
+        return {**self.options, **({"label": self.label} if self.label else {})}
+
 
 FULL = DemoKind(
     "full",

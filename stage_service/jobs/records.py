@@ -30,8 +30,8 @@ class JobOptions(Strict):
     `held_out_cameras` and `held_out_lights` are excluded from reconstruction and fit; their images
     validate the result. `label` is shown on the model's page. `truth` is a strand file to evaluate
     against, with baselines of strands unless `baselines` is false, or a folder with `strands.npz`
-    and `appearance.json`; `environment` a `.hdr` or `.exr`
-    file, `studio` or `sky`. With `reduced` n every step works on means over n × n pixels.
+    and `appearance.json`; `environment` a `.hdr` or `.exr` file, `studio` or `sky`. With `reduced`
+    n every step works on means over n × n pixels.
     `reconstruct`, `fit`, `inverse_rendering`, `fields` and `assess` are the options of the step of
     that name; those of `assess` include the relit pictures'.
     """

@@ -156,7 +156,7 @@ def test_the_progress_of_all_stages_goes_from_nothing_to_all_once(
     assert (shares[0], shares[-1]) == (0, 1)
     names = [s.name for s in model[1].stages]
     assert [what for what, _ in progress_calls if what in names] == names
-    begun = dict(reversed(progress_calls))  # where each was told of first
+    begun = dict(reversed(progress_calls))  # the first report of each
     assert 0.1 < begun["orientation"] < begun["strands"] < begun["refinement"] < 0.9
 
 

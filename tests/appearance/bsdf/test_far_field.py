@@ -11,6 +11,7 @@ from appearance.bsdf.far_field import PARTS, FarField, azimuthal_table
 from appearance.bsdf.lobes import Fibre
 from appearance.scene.backend import ensure_backend
 from appearance.scene.hair_appearance import HairAppearance
+from appearance.scene.hair_scene import mitsuba_hair
 
 
 def test_without_absorption_all_light_leaves():
@@ -84,3 +85,10 @@ def test_directions_along_the_fibre_and_no_directions_are_finite_or_left_alone()
     active = mi.Bool([True, True, True, False])
     got = np.array(FarField(hair).towards(along)(mi.Vector3f(0, 0.6, 0.8), active))
     assert np.isfinite(got[:, :3]).all()
+
+
+@pytest.mark.parametrize(("roughness", "used"), [(0.14, False), (0.16, True)])
+def test_fibres_with_lobes_narrower_than_a_node_are_scattered_near_field(roughness, used):
+    ensure_backend()
+    hair = HairAppearance((0.1, 0.3, 1.2), roughness, 0.3)
+    assert (mi.load_dict(mitsuba_hair(hair)).parameters.far_field is not None) == used

@@ -101,4 +101,4 @@ def test_a_rig_without_a_dome_has_no_quick_demo(tmp_path):
 def test_the_durations_are_those_of_the_pipelines_steps_until_the_figures(kind):
     steps = PIPELINES[kind.pipeline]
     assert tuple(kind.steps_s) == steps[: steps.index("results") + 1]
-    JobOptions.model_validate(kind.options)
+    assert JobOptions.model_validate(kind.job_options).label == kind.label
