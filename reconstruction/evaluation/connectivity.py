@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from reconstruction.arrays import Array, Ints
+from reconstruction.arrays import Array
 from reconstruction.evaluation.oriented_points import (
     THRESHOLDS,
     Block,
     OrientedPoints,
+    Threshold,
     near_pairs,
 )
 from reconstruction.geometry.strands import Strands
@@ -54,67 +56,70 @@ def length_figures(pred: Strands, true: Strands) -> dict[str, Any]:
 
 
 class SampledStrands:
-    """Strands sampled from one set, and the strands of the other that lie along each."""
+    """Strands sampled from one set, and the strands of the other that lie along each.
 
-    def __init__(self, points: OrientedPoints, seed: int = 0) -> None:
+    `thresholds` contains `LIES_ON`.
+    """
+
+    def __init__(
+        self, points: OrientedPoints, seed: int = 0, thresholds: Sequence[Threshold] = (LIES_ON,)
+    ) -> None:
         order = np.random.default_rng(seed).permutation(len(points.offsets) - 1)[:MOST_STRANDS]
         total = np.cumsum(np.diff(points.offsets)[order])
         self.strands = np.sort(order[: max(1, int((total <= MOST_POINTS).sum()))])
         self.complete = len(self.strands) == len(points.offsets) - 1
         self._block = points.of_strands(self.strands)
         self._counts = np.diff(points.offsets)[self.strands]
-        self._point: list[Ints] = []
-        self._other: list[Ints] = []
+        self._owner = np.repeat(np.arange(len(self.strands)), self._counts)
+        self._best = {threshold: np.zeros(len(self.strands), int) for threshold in thresholds}
+        self._on_any = np.zeros(len(self._block.points), bool)
 
     def look(self, block: Block) -> None:
         """Process a block of the other set; each of its strands is in one block only."""
-        least = np.cos(np.radians(LIES_ON.angle))
-        for i, j in near_pairs(self._block.points, block, LIES_ON.distance):
-            cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
-            hit = np.abs(cosine) > least
-            # count a point near several points of one strand once
-            first, count = block.strand[0], block.strand[-1] - block.strand[0] + 1
-            pair = np.unique(i[hit] * count + (block.strand[j[hit]] - first))
-            self._point.append(pair // count)
-            self._other.append(pair % count + first)
+        first, count = block.strand[0], block.strand[-1] - block.strand[0] + 1
+        for threshold, best in self._best.items():
+            least = np.cos(np.radians(threshold.angle))
+            parts = [np.zeros(0, np.int64)]
+            for i, j in near_pairs(self._block.points, block, threshold.distance):
+                cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
+                hit = np.abs(cosine) > least
+                # count a point near several points of one strand once
+                parts.append(np.unique(i[hit] * count + (block.strand[j[hit]] - first)))
+            point, other = np.divmod(np.concatenate(parts), count)
+            pair, on_it = np.unique(self._owner[point] * count + other, return_counts=True)
+            np.maximum.at(best, pair // count, on_it)
+            if threshold == LIES_ON:
+                self._on_any[point] = True
 
-    def shares(self) -> Array:
+    def shares(self, threshold: Threshold = LIES_ON) -> Array:
         """The largest share of each sampled strand that lies on one other strand `(N,)`."""
-        which, _, count = self._pairs()
-        best = np.zeros(len(self.strands))
-        np.maximum.at(best, which, count)
-        return best / self._counts
+        return np.asarray(self._best[threshold] / self._counts)
 
     def covered(self) -> Array:
         """The share of each sampled strand that lies on any other strand `(N,)`."""
-        on_any = np.zeros(len(self._block.points))
-        for points in self._point:
-            on_any[points] = 1.0
         starts = np.cumsum(self._counts) - self._counts
-        return np.asarray(np.add.reduceat(on_any, starts) / self._counts)
-
-    def _pairs(self) -> tuple[Ints, Ints, Ints]:
-        """Sampled strand (index), other strand, and the number of points of the first on it."""
-        point, other = (
-            np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (self._point, self._other)
-        )
-        owner = np.repeat(np.arange(len(self.strands)), self._counts)[point]
-        width = int(other.max(initial=0)) + 1
-        pair, count = np.unique(owner * width + other, return_counts=True)
-        return pair // width, pair % width, count
+        return np.asarray(np.add.reduceat(self._on_any, starts, dtype=float) / self._counts)
 
 
 def connectivity_figures(pred: SampledStrands | None, true: SampledStrands) -> dict[str, Any]:
-    """Correspondence of whole strands, by strands sampled from both sets.
+    """Correspondence of whole strands, by strands sampled from both sets, true at all `THRESHOLDS`.
 
     `pred.on_one`: the largest share of a predicted strand that lies on one true strand;
     `true.by_one`: the largest share of a true strand covered by one predicted strand;
     `true.covered`: the share covered by all of them. Each with mean, percentiles and the mean's
     standard error.
+
+    `true.strand_consistency`: the mean of `by_one` at each threshold, the metric of Pan et al.,
+    "HairGS: Hair Strand Reconstruction based on 3D Gaussian Splatting", BMVC 2025. Additional
+    predicted strands never lower it, since one of them may lie along several true strands and none
+    is compared in length.
     """
     out: dict[str, Any] = {"lies_on": LIES_ON.name, "true": {"followed": len(true.strands)}}
     for name, values in (("by_one", true.shares()), ("covered", true.covered())):
         out["true"][name] = _spread_and_error(values, true.complete)
+    out["true"]["strand_consistency"] = {
+        threshold.name: float(true.shares(threshold).mean()) for threshold in THRESHOLDS
+    }
     if pred is not None:
         on_one = _spread_and_error(pred.shares(), pred.complete)
         out["pred"] = {"followed": len(pred.strands), "on_one": on_one}

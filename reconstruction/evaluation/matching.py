@@ -116,7 +116,7 @@ class StrandComparison:
         self._kept = equal_length(pred, true, seed)
         self._kept_recall = {k: Matches(pair[1].drawn) for k, pair in self._parts.items()}
         self._predicted_strands = SampledStrands(self.predicted, seed) if len(pred) else None
-        self._true_strands = SampledStrands(self.truth, seed)
+        self._true_strands = SampledStrands(self.truth, seed, THRESHOLDS)
 
     def match_predicted(self, *more: BlockConsumer) -> None:
         """Match the predicted points; `more` also receives the blocks of the truth."""
@@ -184,7 +184,8 @@ def compare_strands(
     - `directed.{visible,all}`: with directed tangents;
     - `equal_length.{visible,all}`: of the prediction at the true total length (`equal_length`),
       since density raises recall;
-    - `lengths` (`length_figures`), `connectivity` (`connectivity_figures`).
+    - `lengths` (`length_figures`), `connectivity` (`connectivity_figures`, with the strand
+      consistency of HairGS).
 
     Scores map `1mm_10deg`, `2mm_20deg`, `3mm_30deg` to
     `{"precision", "recall", "f", "precision_error", "recall_error"}`.

@@ -49,6 +49,12 @@ def strand_figure(scores: Mapping[str, Any], place: Sequence[str]) -> float | No
     return float(found) if place and not isinstance(found, Mapping) else None
 
 
+def consistency_cells(scores: Mapping[str, Any]) -> list[str]:
+    """Strand consistency at each of `THRESHOLDS` in per cent; none if missing."""
+    found = scores.get("connectivity", {}).get("true", {}).get("strand_consistency", {})
+    return [f"{100 * found[t]:.1f}" for t in THRESHOLDS if t in found]
+
+
 def strand_cells(
     scores: Mapping[str, Any], places: Sequence[Sequence[str]] | None = None
 ) -> list[str]:

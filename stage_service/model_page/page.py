@@ -29,6 +29,7 @@ from stage_service.model_page.names import (
     PICTURES,
     STRAND_FIGURES,
     STRANDS,
+    consistency_cells,
     strand_cells,
     threshold,
 )
@@ -267,6 +268,9 @@ def _strand_table(found: Mapping[str, Any]) -> Html:
                         for s in scores[over].values()
                     ]
                     rows.append([f"{over} points{how}", _ours(name, STRANDS), *cells])
+    for name, figures in found.items():
+        if cells := consistency_cells(figures):
+            rows.append(["strand consistency", _ours(name, STRANDS), *cells])
     scored = table(["", "", *heads], rows, "figures")
     if "lengths" not in first:
         return scored  # of an earlier version

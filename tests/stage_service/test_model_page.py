@@ -70,7 +70,10 @@ def model(tmp_path):
     (model.path / 'x"y?.txt').write_text("a user's own")
     score = {"1mm_10deg": {"precision": 0.5, "recall": 0.25, "f": 1 / 3}}
     results = {
-        "geometry": {"visible": score, "all": score},
+        "geometry": {
+            **{"visible": score, "all": score},
+            "connectivity": {"true": {"strand_consistency": {"1mm_10deg": 0.123}}},
+        },
         "baselines": {"hull_vertical": {"visible": score, "all": score}},
         "images": {"held_out_lights": {"ours": {"psnr": 17.25, "ssim": 0.5}}},
         "appearance": {"fitted": {"beta_m": 0.33}, "true": {"beta_m": 0.28}},
@@ -87,6 +90,7 @@ def test_everything_that_is_known_stands_on_the_page(model):
         *("σ_a 0.1 ± 5%, 0.2 ± 6%, 0.4"),
         *("growth of strands look here", "voxels", "no hair", "3 of 4"),
         *("off mm0.5 (0.25 to 1.5: 10 to 90 %)", "50.0 / 25.0 / 33.3", "hull + vertical"),
+        "strand consistencyours12.3",
         *("17.2 dB / 0.50", "0.280", "1 files"),
     ):
         assert said.replace("0.280", "0.28") in text, said

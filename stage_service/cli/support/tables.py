@@ -12,6 +12,7 @@ from stage_service.model_page.names import (
     OF_TRUTH,
     STRAND_FIGURES,
     THRESHOLDS,
+    consistency_cells,
     strand_cells,
     strand_figure,
     threshold,
@@ -21,8 +22,8 @@ _HEADS = [threshold(t) for t in THRESHOLDS]
 
 
 def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Group:
-    """Precision, recall and F in per cent, as it is and at equal length, rows for each of `rows`;
-    and how long and how whole the strands are."""
+    """Precision, recall and F in per cent, as it is and at equal length, and strand consistency,
+    rows for each of `rows`; and how long and how whole the strands are."""
     table = Table(
         "strands", "over", *_HEADS, title="Strands against the true ones: precision / recall / F, %"
     )
@@ -32,6 +33,9 @@ def geometry_table(rows: Mapping[str, Mapping[str, Any]]) -> Group:
                 scores = figures.get(at, {}) if at else figures
                 if over in scores:
                     table.add_row(name, over + how, *_cells(scores[over]))
+    for name, figures in rows.items():
+        if cells := consistency_cells(figures):
+            table.add_row(name, "strand consistency, %", *cells)
     more = Table("strands", *(title for title, *_ in STRAND_FIGURES))
     for name, figures in rows.items():
         if any(strand_figure(figures, read) is not None for *_, read in STRAND_FIGURES):

@@ -125,6 +125,48 @@ def test_a_strand_that_changes_hairs_lies_on_one_of_them_by_half() -> None:
     assert missing["covered"]["mean"] == pytest.approx(0.4)
 
 
+def consistency(pred: Strands, true: Strands) -> list[float]:
+    """Strand consistency at 1, 2 and 3 mm."""
+    found = assess_strands(pred, true).figures["connectivity"]["true"]
+    assert found["strand_consistency"]["2mm_20deg"] == found["by_one"]["mean"]
+    return [found["strand_consistency"][t.name] for t in oriented_points.THRESHOLDS]
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 4, 10])
+def test_strand_consistency_of_strands_in_equal_pieces(pieces: int) -> None:
+    true = row(length=0.0999)  # 101 points
+    assert consistency(true, true) == [1.0, 1.0, 1.0]
+    cuts = np.linspace(0, 0.1, pieces + 1)
+    cut = [
+        np.array([[a + 3.5e-3, y, 0], [b - 3.5e-3, y, 0]])
+        for y in 0.02 * np.arange(5)
+        for a, b in pairwise(cuts)
+    ]
+    # a piece covers its length without 3.5 mm at both ends, and 1 to 3 mm beyond them
+    expected = [(100 / pieces - 7 + 2 * reach) / 101 for reach in (1, 2, 3)]
+    assert consistency(Strands.from_list(cut), true) == pytest.approx(expected)
+
+
+def test_strand_consistency_of_strands_that_are_shifted_or_turned() -> None:
+    for shift, expected in ((1.5e-3, [0, 1, 1]), (2.5e-3, [0, 0, 1]), (3.5e-3, [0, 0, 0])):
+        assert consistency(row().transformed(np.eye(3), [0, 0, shift]), row()) == expected
+    true = lines(np.array([[-2e-3, 0, 0]]), np.array([[2e-3, 0, 0]]))
+    for degrees, expected in ((9, [1, 1, 1]), (25, [0, 0, 1]), (35, [0, 0, 0])):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        turned = true.transformed([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.zeros(3))
+        assert consistency(turned, true) == expected
+
+
+def test_strand_consistency_of_two_strands_that_swap_in_the_middle_is_a_half() -> None:
+    swapped = Strands.from_list(
+        [
+            np.array([[0, a, 0], [0.0495, a, 0], [0.0505, b, 0], [0.1, b, 0]])
+            for a, b in ((0, 0.02), (0.02, 0))
+        ]
+    )
+    assert consistency(swapped, row(2)) == pytest.approx([0.5, 0.5, 0.5], abs=0.03)
+
+
 def test_wholeness_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     true = row(12, apart=1e-3)
     pred = true.transformed(np.eye(3), [0, 5e-4, 1e-3]).subset(np.arange(3, 9))

@@ -325,11 +325,15 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
     figures = data["all"]["1mm_10deg"]
     assert figures["precision"] == 1.0
     assert figures["recall"] == pytest.approx(0.5, abs=0.02)
+    consistency = data["connectivity"]["true"]["strand_consistency"]
+    assert consistency == dict.fromkeys(data["all"], 0.5)
     assert main(["evaluate", "geometry", *[str(tmp_path / "true.npz")] * 2]) == 0
     printed = capsys.readouterr().out
     assert printed.count("100.0 / 100.0 / 100.0") >= 9
     assert "equal length" in printed
     assert "root to tip" in printed
+    consistency = next(line for line in printed.splitlines() if "strand consistency" in line)
+    assert consistency.count("100.0") == 3
 
 
 @pytest.mark.parametrize(
