@@ -168,6 +168,16 @@ def button(page: Any) -> None:
     page.click("button.blackout")
 
 
+PRESSES = (f9, button)
+
+
+def response_to(press: Callable[[Any], None], page: Any) -> Any:
+    """The service's response to the blackout that this press sends."""
+    with page.expect_response("**/devices/blackout") as found:
+        press(page)
+    return found.value
+
+
 # Each state: brings a page into it while a lamp is lit, and returns the page.
 
 
@@ -240,10 +250,8 @@ RESPONDING = {
 }
 
 
-@pytest.mark.parametrize(
-    ("press", "state"),
-    [((f9, button)[k % 2], state) for k, state in enumerate(RESPONDING)],
-)
+@pytest.mark.parametrize("press", PRESSES)
+@pytest.mark.parametrize("state", RESPONDING)
 def test_blackout_while_the_service_responds(press, state, desk, film):
     page = RESPONDING[state](desk)
     film.take(page, f"{state}_before", sizes=SHOWN, brightest=2 * BRIGHTEST)
@@ -262,8 +270,9 @@ def test_a_page_that_was_never_logged_in_shows_that_it_cannot_darken(desk, film)
     page = desk.pages().open()
     page.wait_for_selector(".alarm:has-text('This page cannot darken the stage.')")
     capture = desk.light()
-    button(page)
-    page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})")
+    for press in PRESSES:
+        assert response_to(press, page).status == 401
+        page.wait_for_selector(f".alarm:has-text({NOT_DARKENED!r})")
     assert desk.http.get(f"/captures/{capture}").json()["state"] == "running"
     film.take(page, "never_logged_in", sizes=SHOWN, brightest=2 * BRIGHTEST)
     page.fill("[name=token]", own_token())
@@ -281,9 +290,10 @@ def test_a_lamp_that_stays_lit_is_named_when_blackout_is_pressed(stage, film):
     desk.light()
     says(page, "UNSAFE")
     (lamp,) = desk.world.lamps.power().nonzero()[0]
-    button(page)
-    page.wait_for_selector(".notice:has-text('unknown, unsafe')")
-    assert desk.lit
+    for press in PRESSES:
+        assert response_to(press, page).json()["state"] == "unknown, unsafe"
+        page.wait_for_selector(".notice:has-text('unknown, unsafe')")
+        assert desk.lit
     assert f"light_{lamp:03d} was lit last" in page.text_content(".alarm.latch")
     assert page.text_content("circle.doubt title") == f"light_{lamp:03d}"
     assert "verified" not in page.text_content("body")
@@ -305,9 +315,9 @@ def no_response(page: Any, desk: Desk) -> None:
     assert "left" not in page.text_content("#top .detail")
 
 
-def frozen_or_dead(desk: Desk, *presses: Callable[[Any], None]) -> dict[Callable[[Any], None], Any]:
+def frozen_or_dead(desk: Desk) -> dict[Callable[[Any], None], Any]:
     """A page for each way to press, that shows a lit lamp."""
-    pages = {press: desk.page() for press in presses}
+    pages = {press: desk.page() for press in PRESSES}
     desk.light()
     for page in pages.values():
         page.wait_for_selector("circle.light.lit")
@@ -327,7 +337,7 @@ def press_without_response(desk: Desk, pages: dict[Callable[[Any], None], Any]) 
 
 @pytest.mark.parametrize("login", ["kept", pytest.param("ended", marks=pytest.mark.slow)])
 def test_blackout_is_repeated_until_a_restarted_service_responds(login, desk, film):
-    pages = frozen_or_dead(desk, button)
+    pages = frozen_or_dead(desk)
     desk.kill()
     press_without_response(desk, pages)
     if login == "kept":
@@ -355,7 +365,7 @@ def test_blackout_is_repeated_until_a_restarted_service_responds(login, desk, fi
 
 
 def test_blackout_over_a_frozen_service_is_shown_without_a_response(desk, film):
-    pages = frozen_or_dead(desk, f9)
+    pages = frozen_or_dead(desk)
     desk.process.send_signal(signal.SIGSTOP)
     press_without_response(desk, pages)
     film.take(pages[f9], "frozen", sizes=SHOWN, brightest=2 * BRIGHTEST)
