@@ -44,6 +44,7 @@ function jobOf(view, id) {
   const what = h("p.status");
   const meter = h("progress", { max: 1, "aria-label": "done" });
   const acts = h(".line");
+  const strands = h("a.button", { hidden: true }, "View the strands");
   const curves = h(".grid");
   const stages = h("tbody");
   const timed = h("section", h("h2", "Stages"), h("table", h("thead", h("tr", h("th", "stage"), h("th.n", "seconds"), h("th", "warnings"))), stages));
@@ -104,10 +105,11 @@ function jobOf(view, id) {
     const key = `${job.state}/${job.outcome}/${may}`;
     if (acts.dataset.key === key) return;
     acts.dataset.key = key;
+    strands.href = `/view#model=${encodeURIComponent(job.model.split("/").at(-1))}`;
     acts.replaceChildren(
       ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await request(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
       ...(job.state === "done" && job.outcome !== "succeeded" && may ? [button("Run it again", () => attempt(again))] : []),
-      h("a.button", { href: `/view#model=${encodeURIComponent(job.model.split("/").at(-1))}` }, "View the strands"),
+      strands,
       h("a.button", { href: `/models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
     );
   }
@@ -132,6 +134,7 @@ function jobOf(view, id) {
     const has = (path) => list.some((f) => f.path === path);
     page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "open the report in a new page"))] : []),
       ...["relit.webp", "relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));
+    strands.hidden = !has("strands.npz");
     timed.hidden = stages.childElementCount === 0;
     files.hidden = list.length === 0;
     files.replaceChildren(h("details", h("summary", `Files (${list.length})`), h("table", h("tbody", list.map((f) => h("tr", h("td", h("a", { href: link(f.path), download: "" }, f.path)), h("td.n", bytes(f.bytes))))))));

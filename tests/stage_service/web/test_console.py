@@ -12,7 +12,7 @@ from browsing import Pages, says
 from serving import serving
 from waiting import until
 
-from reconstruction import Model
+from reconstruction import Model, Strands
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import Blackout
@@ -425,7 +425,24 @@ def test_an_open_job_shows_its_files_at_its_end_and_runs_again_with_its_options(
     http.delete(f"/jobs/{job}").raise_for_status()
     page.wait_for_selector("dd:text-is('cancelled')")
     page.wait_for_selector("summary:text-is('Files (1)')")
+    assert page.is_visible("text=Download the model")
+    assert not page.is_visible("text=View the strands")
     page.click("button:text-is('Run it again')")
     until(lambda: len(http.get("/jobs").json()) == 2)
     again = next(one for one in http.get("/jobs").json() if one["id"] != job)
     assert pipeline.items() <= {"name": again["pipeline"], **again}.items()
+
+
+def test_a_job_with_strands_links_to_the_viewer(console):
+    http, pages = console()
+    plan = {"lights": [], "projectors": []}
+    capture = http.post("/captures", json={"plan": plan}).json()["id"]
+    until(lambda: http.service.capture(capture).outcome == "completed")
+    model = Model(http.service.root / "models" / "mine").create()
+    line = np.array([[0, 0, 0.1], [0, 0, 0.2]], np.float32)
+    model.write_strands(Strands(line, np.array([0, 2]), 4e-5))
+    request = {"capture": capture, "pipeline": {"name": "fit"}, "model": "mine"}
+    job = http.post("/jobs", json=request).json()["id"]
+    page = pages.open(f"jobs/{job}")
+    link = page.wait_for_selector("a:text-is('View the strands')")
+    assert link.get_attribute("href") == "/view#model=mine"
