@@ -116,7 +116,9 @@ class Submitting:
                 raise ModelInUse(
                     f"model {model.path.name}: job {other} writes it: wait, or cancel it"
                 )
-            return self._queue.submit(request.pipeline, path, model, job=job)
+            made = self._queue.submit(request.pipeline, path, model, job=job)
+        self._follower.follow(job)
+        return made
 
     def latest(self, limit: int, offset: int = 0) -> list[Job]:
         """The latest `limit` jobs after the `offset` newest, newest first."""

@@ -52,6 +52,7 @@ class JobFollower:
         self._wake = threading.Event()
         self._closed = False
         self._known: dict[str, Job] = {}  # the newest jobs, and those not done
+        self._new: set[str] = set()
         self._audited: set[str] | None = None  # jobs whose end is recorded
         self._thread = threading.Thread(target=self._run, name="job-events", daemon=True)
 
@@ -87,6 +88,10 @@ class JobFollower:
         """The id of the capture's job, enqueued or pending."""
         there = capture in self._certain or capture in self._pending
         return job_of(capture) if there else None
+
+    def follow(self, job: str) -> None:
+        """Follow a new job; after the clock was set back it is not among the newest."""
+        self._new.add(job)
 
     def enqueue_now(self, job: str) -> Job | None:
         """Enqueue the pending job of this id; None without one. Raises `JobsUnavailable`."""
@@ -134,6 +139,7 @@ class JobFollower:
         job = self._queue.submit(wish.pipeline, wish.capture, model, job=job_of(capture))
         self._certain.add(capture)
         self._pending.pop(capture, None)
+        self.follow(job.id)
         self._audit.record(SERVICE, "job.submit", job.id, detail=f"{job.pipeline} on {capture}")
         return job
 
@@ -144,7 +150,8 @@ class JobFollower:
             self._audited = {action.subject for action in ends}
         newest = self._queue.all(limit=50 if self._known else MOST_ENDS)
         found = {job.id: job for job in reversed(newest)}
-        older = [i for i, job in self._known.items() if job.state != "done" and i not in found]
+        going = [i for i, job in self._known.items() if job.state != "done"]
+        older = {*going, *self._new.copy()} - found.keys()
         if older:
             found.update({job.id: job for job in self._queue.several(older)})
         for job in found.values():
@@ -159,6 +166,7 @@ class JobFollower:
                 data = {"job": job.id, **job.progress.model_dump(mode="json")}
                 self._events.publish("job.progress", data)
         self._known = found
+        self._new -= found.keys()
 
 
 def _end(job: Job) -> str:

@@ -231,3 +231,26 @@ def test_the_audit_has_the_end_of_every_job_once(tmp_path):
     assert ends() == ["job-00 cancelled", "job-01 cancelled", "job-59 cancelled"]
     assert audit.latest(1)[0].detail.startswith("reconstruct on capture, at 20")
     queue.close()
+
+
+def test_a_new_job_is_followed_after_the_clock_was_set_back(tmp_path):
+    """Jobs are listed by the clock: fifty that were made before are newer by it."""
+    queue, audit = JobQueue(tmp_path), AuditLog(tmp_path / "audit.jsonl")
+    for number in range(51):
+        submit(queue, tmp_path, f"job-{number}", f"m{number}")
+    with sqlite3.connect(tmp_path / "jobs.sqlite") as database:
+        database.execute("UPDATE workflow_status SET created_at = created_at + 30 * 86400000")
+    database.close()
+    follower = JobFollower(tmp_path, queue, EventLog(), audit)
+    follower.start()
+    try:
+        until(lambda: follower.waiting is not None)  # it has listed the jobs
+        follower.follow_up(completed(tmp_path, "late"))
+        until(lambda: job_of("late") in queue.ids())
+        assert job_of("late") not in {job.id for job in queue.all(limit=50)}
+        queue.cancel(job_of("late"))
+        until(lambda: [a.subject for a in audit.latest(10)][-1:] == [job_of("late")])
+        until(lambda: audit.latest(1)[0].action == "job.end")
+    finally:
+        follower.close()
+        queue.close()
