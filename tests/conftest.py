@@ -8,6 +8,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+# Before NumPy is loaded: on shared cores OpenBLAS's threads spin as they wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from hypothesis import settings
 from simulating import simulating, small_rig_text
 from waiting import machine_slack
