@@ -731,7 +731,7 @@ def test_no_lamp_is_lit_without_permission(monkeypatch, tmp_path, wire, world):
 def test_no_lamp_is_lit_without_permission_in_ten_thousand_steps(
     monkeypatch, tmp_path, wire, world
 ):
-    done = run(monkeypatch, tmp_path, wire, world, examples=480, steps=25, derandomize=False)
+    done = run(monkeypatch, tmp_path, wire, world, examples=560, steps=25, derandomize=False)
     print(dict(done))
     assert done["steps"] >= 10_000
     assert done["lights"] > 0
