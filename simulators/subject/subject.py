@@ -91,7 +91,7 @@ def load_subject(
     if len(strands) == 0:
         raise SubjectError(f"{path}: no strands")
     wanted = covering_radius(len(strands))
-    given = float(np.mean(strands.radius))
+    given = _mean_radius(strands)
     if given < 0.5 * wanted:
         say(
             f"{path.name}: {len(strands)} strands of {given * 1e3:.3f} mm radius cover less than a "
@@ -101,6 +101,12 @@ def load_subject(
         strands = replace(strands, radius=wanted)
     mesh = read_obj(head) if head is not None else None
     return Subject(path.stem, strands, mesh, _FILE_APPEARANCE, _FILE_SKIN)
+
+
+def _mean_radius(strands: Strands) -> float:
+    """The mean over strands, metres, whatever the number of their points."""
+    radius = np.broadcast_to(np.asarray(strands.radius, float), len(strands.points))
+    return float((np.add.reduceat(radius, strands.offsets[:-1]) / np.diff(strands.offsets)).mean())
 
 
 def check_fits(subject: Subject, rig: Rig) -> None:

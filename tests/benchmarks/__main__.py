@@ -37,6 +37,7 @@ MODULES = {
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",
+    "pixels": "benchmarks.pixels.study",
     "renderers": "benchmarks.renderers.errors",
     "soak": "benchmarks.service.soak",
     "viewer": "benchmarks.viewer.shown",
