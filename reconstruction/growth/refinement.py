@@ -23,39 +23,44 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands, unit_or_zero
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
-from reconstruction.tangents.line_evidence import half_sphere
+from reconstruction.tangents.line_evidence import half_sphere, visible_from
 
-REACH = 4e-3  # metres within which measured lines support a point
-NEAR, ALIKE_DEG = 1e-3, 10.0  # standard deviations of a line's support in metres and degrees
-GUESS = 0.05  # coverage of a millimetre without measurement; 1 with the best
-CELL, HEADINGS = 1e-3, 24  # metres and directions of a coverage cell
+WIDTH = 1e-3
+"""Metres: the standard deviation of a line's support across itself, where lines are not denser."""
+WIDTHS_APART = 0.8  # the same in distances between measured lines, where they are
 
-POINT_DEVIATION = 0.5e-3  # metres of a measured line across itself
+# Lengths in widths: within which lines support a point; a line's deviation across itself; behind
+# the visible surface where hair is occluded, and the deviation of that; the largest step.
+REACH, POINT_DEVIATION, BEHIND, BEHIND_DEVIATION, _LARGEST_STEP = 4.0, 0.5, 1.0, 1.0, 2.0
+
+ALIKE_DEG = 10.0  # standard deviation of a line's support
+GUESS = 0.05  # coverage of a cell without measurement; 1 with the best
+HEADINGS = 24  # directions of a coverage cell
+
 ANGLE_DEVIATION = np.radians(30.0)
 """Of a measured line of confidence 1: twice its error, as neighbouring lines' errors correlate."""
 BEND_DEVIATION = 0.2  # per point, of the change of the turn from one point to the next
 GUESS_DEVIATION = 3e-3  # metres, of the displacement of an unsupported point
 COMPATIBLE = np.cos(np.radians(35.0))
 GUESSED = 0.05  # support up to which a point is guessed
-BEHIND, BEHIND_DEVIATION = 1e-3, 1e-3
-"""Metres behind the visible surface at which hair is occluded, and the deviation of that."""
 
 _NEIGHBOURS = 6
-_SAMPLE = 1e-3  # metres between the points at which strands are compared
-_LARGEST_STEP = 2e-3  # metres a step
 
 
 class Lines:
-    """Measured lines, looked up by place and direction."""
+    """Measured lines, looked up by place and direction; `width` in metres (see `WIDTH`)."""
 
-    def __init__(self, lines: Measured) -> None:
+    def __init__(self, lines: Measured, apart: float = np.inf) -> None:
+        """`apart` is the distance between neighbouring lines, metres."""
         self.lines = lines
+        self.width = min(WIDTH, WIDTHS_APART * apart)
         self._tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
 
     def near(self, points: AnyFloats) -> tuple[Array, Ints, Bools]:
         """Distances, numbers and whether there is one, each `(N, K)`, of lines within `REACH`."""
         k = np.arange(1, min(_NEIGHBOURS, len(self.lines.points)) + 1)
-        distance, index = self._tree.query(points, k=k, distance_upper_bound=REACH, workers=-1)
+        reach = REACH * self.width
+        distance, index = self._tree.query(points, k=k, distance_upper_bound=reach, workers=-1)
         found = np.isfinite(distance)
         return np.where(found, distance, 0.0), np.where(found, index, 0), found
 
@@ -68,7 +73,7 @@ class Lines:
         distance, index, found = self.near(points)
         cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents))
         turn = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
-        alike = np.exp(-0.5 * (distance / NEAR) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
+        alike = np.exp(-0.5 * (distance / self.width) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
         return np.asarray(np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1))
 
 
@@ -78,16 +83,20 @@ Surfaces = Sequence[tuple[Camera, Array]]
 
 @dataclass(frozen=True, eq=False)
 class Guesses:
-    """Points `which (G,)` of strands that no line supports, and the surfaces that cameras see."""
+    """Points `which (G,)` of strands that no line supports, and the surfaces that cameras see.
+
+    `width` is that of the lines, metres.
+    """
 
     which: Ints
     surfaces: Surfaces
+    width: float
 
     @classmethod
     def of(cls, strands: Strands, lines: Lines, surfaces: Surfaces) -> Guesses:
         """Those of `strands`."""
         support = lines.support(strands.points, strands.tangents())
-        return cls(np.flatnonzero(support < GUESSED), surfaces)
+        return cls(np.flatnonzero(support < GUESSED), surfaces, lines.width)
 
     def out_of_sight(self, points: AnyFloats) -> Array:
         """Displacement `(G, 3)`, metres, that occludes each guessed one of `points (N, 3)`.
@@ -101,7 +110,8 @@ class Guesses:
             visible, column, row, depth = camera.pixels_of(x)
             there = surface[row, column]
             front = there - depth
-            short = np.where(visible & (there > 0) & (front < REACH), front + BEHIND, 0.0)
+            near = visible & (there > 0) & (front < REACH * self.width)
+            short = np.where(near, front + BEHIND * self.width, 0.0)
             more = short > most
             most[more] = short[more]
             out[more] = short[more, None] * unit_or_zero(x[more] - camera.center)
@@ -110,19 +120,25 @@ class Guesses:
     def in_front(self, points: AnyFloats) -> float:
         """The share of `points (N, 3)` that are guessed in front of the visible surface."""
         way = np.linalg.norm(self.out_of_sight(points), axis=1)
-        return float((way > BEHIND).sum()) / max(len(points), 1)
+        return float((way > BEHIND * self.width).sum()) / max(len(points), 1)
 
 
 def refine(
-    strands: Strands, measured: Measured, options: RefineOptions, surfaces: Surfaces = ()
+    strands: Strands,
+    measured: Measured,
+    options: RefineOptions,
+    surfaces: Surfaces = (),
+    apart: float = np.inf,
 ) -> tuple[Strands, dict[str, Any]]:
     """Drop the strands that add no coverage and move the others onto the measured lines.
 
-    Guessed points move behind the `surfaces`. Also returns JSON-ready figures. At least one line
-    must be measured. Raises `ValueError` where no strand adds `options.marginal_coverage`.
+    Guessed points move behind the `surfaces`; lines are `apart` metres from one another. Also
+    returns JSON-ready figures. At least one line must be measured. Raises `ValueError` where no
+    strand adds `options.marginal_coverage`.
     """
-    lines = Lines(measured)
-    kept = select_by_coverage(strands, lines, options.marginal_coverage)
+    lines = Lines(measured, apart)
+    strands = without_exposed_ends(strands, lines, surfaces)
+    kept = select_by_coverage(strands, lines, options.marginal_coverage, surfaces)
     if not kept.any():
         raise ValueError(
             f"no strand adds refine.marginal_coverage {options.marginal_coverage:g} per "
@@ -147,24 +163,55 @@ def refine(
     return out, figures
 
 
-def supported(strands: Strands, measured: Measured) -> Floats:
+def supported(strands: Strands, measured: Measured, apart: float = np.inf) -> Floats:
     """Each point's `Strands.confidence (N,)`: `Lines.support`, 0 without any line."""
     if not len(measured.points):
         return np.zeros(len(strands.points), np.float32)
-    support = Lines(measured).support(strands.points, strands.tangents())
+    support = Lines(measured, apart).support(strands.points, strands.tangents())
     return support.clip(0, 1).astype(np.float32)
 
 
-def select_by_coverage(strands: Strands, lines: Lines, marginal_coverage: float) -> Bools:
-    """Which strands `(S,)` add at least `marginal_coverage` per millimetre.
+def without_exposed_ends(strands: Strands, lines: Lines, surfaces: Surfaces) -> Strands:
+    """Strands that end where no line supports them any more although cameras see them.
 
-    A cell of a millimetre and some 15 degrees is covered by the support of the best strand in it,
-    at least by `GUESS`. Lazy greedy selection: a strand's marginal coverage only falls.
+    A strand without any supported point stays as it is.
     """
-    dense = strands.resampled(_SAMPLE)
+    if not surfaces:
+        return strands
+    support = lines.support(strands.points, strands.tangents())
+    count = np.diff(strands.offsets)
+    place = np.arange(len(support)) - np.repeat(strands.offsets[:-1], count)
+    ends = (support < GUESSED) & exposed(strands.points, surfaces, lines.width)
+    last = np.maximum.reduceat(np.where(ends, -1, place), strands.offsets[:-1])
+    last = np.where(last < 1, count - 1, last)  # a strand has two points
+    keep = place <= np.repeat(last, count)
+    offsets = np.append(0, np.cumsum(last + 1))
+    radius = strands.radius[keep] if isinstance(strands.radius, np.ndarray) else strands.radius
+    return Strands(strands.points[keep], offsets, radius)
+
+
+def exposed(points: AnyFloats, surfaces: Surfaces, width: float) -> Bools:
+    """Whether some camera sees each of `points (N, 3)`: at most `width` behind its surface."""
+    out = np.zeros(len(points), bool)
+    for camera, surface in surfaces:
+        out |= visible_from(camera, surface, points, width)
+    return out
+
+
+def select_by_coverage(
+    strands: Strands, lines: Lines, marginal_coverage: float, surfaces: Surfaces = ()
+) -> Bools:
+    """Which strands `(S,)` add at least `marginal_coverage` per width of the lines.
+
+    A cell of a width and some 15 degrees is covered by the support of the best strand in it, and
+    by `GUESS` where no camera sees it. Lazy greedy selection: a strand's marginal coverage only
+    falls.
+    """
+    dense = strands.resampled(lines.width)
     tangents = dense.tangents()
-    value = GUESS + lines.support(dense.points, tangents)
-    cells = _cells(dense.points, tangents)
+    hidden = ~exposed(dense.points, surfaces, lines.width)
+    value = GUESS * hidden + lines.support(dense.points, tangents)
+    cells = _cells(dense.points, tangents, lines.width)
     best = np.zeros(int(cells.max(initial=-1)) + 1)
     ends = dense.offsets
     own = [_mean_by(cells[a:b], value[a:b]) for a, b in pairwise(ends)]
@@ -191,10 +238,10 @@ def select_by_coverage(strands: Strands, lines: Lines, marginal_coverage: float)
     return kept
 
 
-def _cells(points: AnyFloats, tangents: AnyFloats) -> Ints:
+def _cells(points: AnyFloats, tangents: AnyFloats, width: float) -> Ints:
     """Numbers `(N,)`, from 0 on, of the cells of place and direction that points lie in."""
     heading = np.abs(tangents @ half_sphere(HEADINGS).T.astype(np.float32)).argmax(axis=1)
-    place = np.floor(points / CELL).astype(np.int64)
+    place = np.floor(points / width).astype(np.int64)
     place -= place.min(axis=0, initial=0)
     size = place.max(axis=0, initial=0) + 1
     flat = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * HEADINGS + heading
@@ -213,7 +260,9 @@ def residuals(strands: Strands, lines: Lines) -> dict[str, float]:
     Over the lines within `REACH` of a strand; `explained` is their share.
     """
     tree = cKDTree(strands.points, balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(lines.lines.points, distance_upper_bound=REACH, workers=-1)
+    distance, index = tree.query(
+        lines.lines.points, distance_upper_bound=REACH * lines.width, workers=-1
+    )
     found = np.isfinite(distance)
     if not found.any():
         return {"explained": 0.0}
@@ -251,14 +300,20 @@ def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: G
     _hold_to_lines(x, tangents, lines, diagonal[0], right)
     _turn_to_lines(x, tangents, lines, ~last, diagonal, right)
     _hide(x, guesses, diagonal[0], right)
-    return replace(strands, points=(x + _limited(_solve(diagonal, right))).astype(np.float32))
+    return replace(
+        strands,
+        points=(x + _limited(_solve(diagonal, right), _LARGEST_STEP * lines.width)).astype(
+            np.float32
+        ),
+    )
 
 
 def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: Array) -> None:
     """Each line against its nearest point of compatible tangent, across the line."""
     p, d, c = lines.lines.points, lines.lines.directions, lines.lines.confidence
     tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=REACH, workers=-1)
+    reach = REACH * lines.width
+    distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=reach, workers=-1)
     found = np.isfinite(distance)
     index = np.where(found, index, 0)
     alike = found & (np.abs(np.einsum("nki,ni->nk", tangents[index], d)) >= COMPATIBLE)
@@ -266,9 +321,10 @@ def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: A
     i = index[which, alike[which].argmax(axis=1)]
     across = np.eye(3) - d[which, :, None] * d[which, None, :]
     offset = np.einsum("nij,nj->ni", across, p[which] - x[i])
-    # Geman-McClure: lines millimetres away belong to another strand
-    far = (offset**2).sum(axis=1) / (3 * POINT_DEVIATION) ** 2
-    weight = c[which] / POINT_DEVIATION**2 / (1 + far) ** 2
+    # Geman-McClure: lines widths away belong to another strand
+    deviation = POINT_DEVIATION * lines.width
+    far = (offset**2).sum(axis=1) / (3 * deviation) ** 2
+    weight = c[which] / deviation**2 / (1 + far) ** 2
     np.add.at(own, i, weight[:, None, None] * across)
     np.add.at(right, i, weight[:, None] * offset)
 
@@ -284,7 +340,7 @@ def _turn_to_lines(
     distance, index, found = lines.near(0.5 * (x[i] + x[i + 1]))
     d = lines.lines.directions[index]
     cosine = np.einsum("nki,ni->nk", d, along)
-    near = np.exp(-0.5 * (distance / NEAR) ** 2) * lines.lines.confidence[index] ** 2
+    near = np.exp(-0.5 * (distance / lines.width) ** 2) * lines.lines.confidence[index] ** 2
     weight = np.where(found & (np.abs(cosine) >= COMPATIBLE), near, 0.0)
     mean = unit_or_zero(np.einsum("nk,nki->ni", weight * np.sign(cosine), d))
     total = weight.sum(axis=1) / np.maximum(length * ANGLE_DEVIATION, 1e-9) ** 2
@@ -301,8 +357,10 @@ def _hide(x: Array, guesses: Guesses, own: Array, right: Array) -> None:
     """Each visible guessed point against its occluded position, along the ray."""
     way = guesses.out_of_sight(x)
     ray = unit_or_zero(way)
-    own[guesses.which] += ray[:, :, None] * ray[:, None, :] / BEHIND_DEVIATION**2
-    right[guesses.which] += way / BEHIND_DEVIATION**2
+    own[guesses.which] += (
+        ray[:, :, None] * ray[:, None, :] / (BEHIND_DEVIATION * guesses.width) ** 2
+    )
+    right[guesses.which] += way / (BEHIND_DEVIATION * guesses.width) ** 2
 
 
 def _bend_little(x: Array, last: Bools, diagonal: Array) -> None:
@@ -341,7 +399,7 @@ def _solve(diagonal: Array, right: Array) -> Array:
     return np.asarray(solveh_banded(banded, right.ravel(), lower=True)).reshape(n, 3)
 
 
-def _limited(step: Array) -> Array:
-    """No point moves further than `_LARGEST_STEP`."""
+def _limited(step: Array, most: float) -> Array:
+    """No point moves further than `most` metres."""
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return step * np.minimum(1.0, _LARGEST_STEP / np.maximum(length, 1e-12))
+    return step * np.minimum(1.0, most / np.maximum(length, 1e-12))

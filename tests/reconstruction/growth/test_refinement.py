@@ -8,7 +8,14 @@ from scipy.spatial import cKDTree
 
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
-from reconstruction.growth.refinement import _product, _solve, refine, supported
+from reconstruction.growth.refinement import (
+    Lines,
+    _product,
+    _solve,
+    refine,
+    supported,
+    without_exposed_ends,
+)
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
 
@@ -185,6 +192,41 @@ def test_unmeasured_points_stay_hidden_from_cameras(before: float, expected: flo
     np.testing.assert_allclose(still.points, given.points, atol=1e-6)
     assert figures["guessed_in_front_before"] == (0.5 if before == 1e-3 else 0.0)
     assert figures["guessed_in_front"] < 0.05  # the root
+
+
+@pytest.mark.parametrize(("behind", "kept"), [(0.0, 31), (20e-3, 61)])
+def test_an_exposed_end_that_no_line_supports_is_cut_off(behind: float, kept: int) -> None:
+    """Lines on the lower half of a strand; its upper half bends to `behind` the visible wall.
+
+    Hidden hair stays, since no camera contradicts it. A strand without any line stays, too.
+    """
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    K = np.array([[500.0, 0, 49.5], [0, 500, 49.5], [0, 0, 1]])
+    camera = Camera(name="c", K=K, R=axes, t=-axes @ [0, -0.5, 0], width=100, height=100)
+    z = np.linspace(-0.03, 0.03, 61)
+    path = np.stack([0 * z, np.where(z > 0, behind, 0.0), z], axis=1)
+    low = path[:31]
+    up = np.tile([0.0, 0.0, 1.0], (len(low), 1))
+    measured = Lines(Measured(low, up, np.ones(len(low))))
+    given = Strands.from_list([path, path + np.array([0.03, 0.0, 0.0])])
+    out = without_exposed_ends(given, measured, [(camera, np.full((100, 100), 0.5))])
+    counts = np.diff(out.offsets)
+    assert counts[0] == pytest.approx(kept, abs=4)  # support reaches 2.4 mm beyond the last line
+    assert counts[1] == 61
+    np.testing.assert_array_equal(out.roots, given.roots)
+
+
+def test_lines_that_are_denser_support_and_cover_less_far() -> None:
+    measured = lines(0.0, 0.0)
+    assert Lines(measured).width == pytest.approx(1e-3)
+    assert Lines(measured, 5e-4).width == pytest.approx(4e-4)
+    aside = Strands.from_list([np.linspace([1e-3, 0, 0], [1e-3, 0, 50e-3], 51)])
+    straight = Measured(
+        np.linspace([0, 0, 0], [0, 0, 50e-3], 51), np.tile([0, 0, 1.0], (51, 1)), np.ones(51)
+    )
+    wide, narrow = (supported(aside, straight, apart) for apart in (np.inf, 5e-4))
+    assert wide[25] == pytest.approx(np.exp(-0.5), rel=1e-3)
+    assert narrow[25] == pytest.approx(np.exp(-0.5 * 2.5**2), rel=1e-3)
 
 
 def test_the_banded_solution_and_product_are_the_dense_ones() -> None:
