@@ -17,6 +17,7 @@ import numpy as np
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.frame_cache import cache_bytes
 from reconstruction.capture.records import CaptureError, MissingFrame, Step, StepKind
+from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.cameras import Camera
 from reconstruction.head.capture_head import HeadPoints, digitised_points
 from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
@@ -31,7 +32,13 @@ from reconstruction.pipeline import FINE_PIXEL, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent
 from reconstruction.stages import method_for
-from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
+from reconstruction.tangents.estimate import (
+    BANK,
+    CANDIDATES,
+    LIGHT_GROUPS,
+    WAVELENGTH_GROUPS,
+    WAVELENGTHS,
+)
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
 
 KNOWN_TASK = 0.0155
@@ -205,11 +212,16 @@ class _Probe:
         return float(np.median([np.linalg.norm(c.center) / c.K[0, 0] for c in self.cameras]))
 
     @cached_property
+    def scale(self) -> CaptureScale:
+        """The lengths that the capture resolves."""
+        return CaptureScale.of_pixel(self.pixel, self.options)
+
+    @cached_property
     def points(self) -> float:
         """Points with measured directions: one per two pixels, until the surface is saturated."""
         sphere = 4 * self.hair / len(self.cameras) * self.pixel**2  # of the same outline
         deep = SWEPT if self.capture.of_kind("scanline") else UNSWEPT
-        most = deep * sphere / self.options.measure.thin**2
+        most = deep * sphere / self.scale.thin**2
         return most * (1 - float(np.exp(-0.7 * self.hair / most)))
 
     @cached_property
@@ -217,7 +229,7 @@ class _Probe:
         """Millions of voxels of the envelope: a ball of the outline, its shell for a sweep."""
         share = 0.3 if self.capture.of_kind("scanline") else 1.0
         outline = self.hair / len(self.cameras) * self.pixel**2
-        return share * 0.75e-6 * outline**1.5 / self.options.grid**3
+        return share * 0.75e-6 * outline**1.5 / self.scale.grid**3
 
     def stages(self, requested: Method) -> list[StageCost]:
         """The stages in the order of the report."""
@@ -272,6 +284,7 @@ class _Probe:
             add("head", table=HEAD_FIT)
         elif not known and lights >= FEWEST_LIGHTS_OF_SKIN:
             add("head", 3 * min(lights, MOST_LIGHTS) * self.again, HEAD_FIT)
+        add("scale")
         volume = self.volume
         bare = not known and method == "hull"  # a hull without a head, filled 12 mm deep
         each = 0.1 if bare else 0.5
@@ -307,16 +320,18 @@ class _Probe:
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
-        lights, n, bank = self.lights, self.points, self.options.measure.bank
+        lights, n, bank = self.lights, self.points, self.options.measure.bank or BANK
+        chosen = self.options.measure.bank is None
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        measured = self.frames("olat") * self.again + groups * self.filtering(bank)
+        choice = len(WAVELENGTHS) * WAVELENGTH_GROUPS / LIGHT_GROUPS if chosen else 0.0
+        measured = self.frames("olat") * self.again + groups * (1 + choice) * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
         images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
         scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
         part = 0.35e9 * min(n / 2e4, 1.0)  # of scores being decided
-        times = 4 if reads else 2.4
+        times = 8 if reads else 4.4  # halves of both kinds, sums and averages
         add("orientation", measured, table, max(images, times * scores + part + observed) / GB)
 
     def _line_stereo(

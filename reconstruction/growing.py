@@ -9,6 +9,7 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.records import CaptureError
+from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
@@ -121,6 +122,7 @@ class GrowingStages(Stages):
         cloud: PointCloud,
         cameras: Sequence[Camera],
         depths: Mapping[str, Array],
+        scale: CaptureScale,
     ) -> Strands:
         """Strands refined jointly by the `measured` lines, if there is a sweep.
 
@@ -141,7 +143,7 @@ class GrowingStages(Stages):
                 return strands
             self.progress("refining strands", 0.0)
             surfaces = [(camera, depths[camera.name]) for camera in cameras]
-            strands, figures = refine(strands, lines, o, surfaces)
+            strands, figures = refine(strands, lines, o, surfaces, scale.thin)
             stage.figures.update(figures)
         return strands
 

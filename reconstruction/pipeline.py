@@ -15,7 +15,7 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.growing import GrowingStages
 from reconstruction.growth.field import with_descent
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps
-from reconstruction.growth.hair_envelope import SHELL, build_hull, pixel_size
+from reconstruction.growth.hair_envelope import SHELL, build_hull
 from reconstruction.head.capture_head import FittedHead
 from reconstruction.head.heads import Heads
 from reconstruction.head.scalp import find_scalp
@@ -32,7 +32,7 @@ from reconstruction.tangents.estimate import Measured
 
 FINE_PIXEL = 1e-3  # metres: line stereo fails on pixels twice as wide
 
-_SURFACE, _GROWN = ("envelope", "orientation"), ("field", "strands", "refinement", "roots")
+_SURFACE, _GROWN = ("scale", "envelope", "orientation"), ("field", "strands", "refinement", "roots")
 _LINES = ("lightcodes", "depth", "segments", "connection")
 STAGES: dict[str, tuple[str, ...]] = {
     "light_planes": ("triangulation", "masks", *_SURFACE, "surface", *_GROWN),
@@ -124,9 +124,10 @@ class _Run:
             self.hull(masked, cloud, head or heads.fit_by_shading(masked))
         else:
             head = head or heads.fit_to_skin_points(masked, cloud)
-            envelope, depths = measuring.envelope(masked, cloud, head.mesh)
-            measured = measuring.tangents(masked, cloud, depths)
-            polylines, lines = measuring.surface(measured, cloud), measured
+            scale = measuring.scale(masked, cloud, head)
+            envelope, depths = measuring.envelope(masked, cloud, head.mesh, scale)
+            measured = measuring.tangents(masked, cloud, depths, scale)
+            polylines, lines = measuring.surface(measured, cloud, scale), measured
             if method == "fused":
                 more, segments = measuring.lines(masked, head, "photometric")
                 polylines += more
@@ -135,7 +136,7 @@ class _Run:
             scalp = find_scalp(head.mesh, envelope)
             field = growing.field(envelope, measured, scalp)
             grown = growing.grown(field, scalp, polylines, options.within)
-            grown = growing.refined(grown, measured, cloud, masked.cameras, depths)
+            grown = growing.refined(grown, measured, cloud, masked.cameras, depths, scale)
             growing.rooted(grown, lines, scalp, head.scalp_map)
 
     def line_stereo(
@@ -161,22 +162,24 @@ class _Run:
         """
         o, olat, report = self.stages.options, masked.capture.olat_lights(), self.stages.report
         mesh = None if head is None else head.mesh
+        scale = self.measuring.scale(masked, cloud, head)
         if mesh is None:
             with report.stage("envelope") as stage:
-                envelope, bare, depths = build_hull(masked, grid=o.grid, stage=stage)
+                envelope, bare, depths = build_hull(masked, grid=scale.grid, stage=stage)
         else:
-            envelope, depths = self.measuring.envelope(masked, cloud, mesh)
+            envelope, depths = self.measuring.envelope(masked, cloud, mesh, scale)
             bare = inside_mesh(envelope, mesh)
-        pixel = pixel_size(masked.cameras, envelope.centers().mean(axis=0))
         measured, polylines = Measured.none(), list[AnyFloats]()
         if olat:
-            measured = self.measuring.tangents(masked, cloud, depths)
+            measured = self.measuring.tangents(masked, cloud, depths, scale)
         written = measured
         with report.stage("line stereo") as stage:
             if not olat:
                 stage.warn("no single lights: nothing is measured, all strands are guessed")
-            elif pixel > FINE_PIXEL:
-                why = f"a pixel is {1e3 * pixel:.1f} mm wide, more than {1e3 * FINE_PIXEL:g} mm"
+            elif scale.pixel > FINE_PIXEL:
+                why = (
+                    f"a pixel is {1e3 * scale.pixel:.1f} mm wide, more than {1e3 * FINE_PIXEL:g} mm"
+                )
                 stage.leave_out("line stereo", why, "its stages")
             else:
                 try:
@@ -190,7 +193,7 @@ class _Run:
         within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
             grown = self.growing.grown(field, scalp, polylines, within)
-            grown = self.growing.refined(grown, measured, cloud, masked.cameras, depths)
+            grown = self.growing.refined(grown, measured, cloud, masked.cameras, depths, scale)
             self.growing.rooted(grown, written, scalp, head.scalp_map)
             return
         with report.stage("strands") as stage:

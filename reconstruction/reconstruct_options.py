@@ -36,23 +36,25 @@ class MotionOptions:
 
 @options
 class MeasureOptions:
-    """How tangents are measured.
+    """How tangents are measured; lengths in metres, None: derived from the capture.
 
-    The filter `bank` is applied to images under groups of neighbouring lights. Scores of a point's
-    directions are averaged over up to `neighbours` within `radius`, or within `reflection_radius`
-    if reflections under single lights are used, whose scores count `reflection_weight` times those
-    of the texture. Points closer than `thin` are merged first. Points up to `tolerance` behind a
-    camera's depth are visible in it.
+    The filter `bank` is applied to images under groups of neighbouring lights (None: 24 filters of
+    the wavelength of 4 to 12 pixels by which half of the cameras predicts the other half best);
+    `texture_scale` in pixels is that of their local mean (None: 0.65 wavelengths). Points closer
+    than `thin` are merged first (None: 1.25 pixels). Points up to `tolerance` behind a camera's
+    depth are visible in it (None: 5/3 pixels). Scores of a point's directions are averaged over up
+    to `neighbours` within `radius`; those of reflections under single lights count
+    `reflection_weight` times those of the texture. None: the radius and weight by which half of
+    the cameras predicts the other half best.
     """
 
-    bank: LogGaborBank = LogGaborBank(wavelength=6.0, count=24, spread=1.0)
-    texture_scale: Length = 5.0
-    radius: Length = 10e-3
-    reflection_radius: Length = 4e-3
-    neighbours: Count = 48
-    thin: Length = 2e-3
-    reflection_weight: Factor = 6.0
-    tolerance: Length = 4e-3
+    bank: LogGaborBank | None = None
+    texture_scale: Length | None = None
+    radius: Length | None = None
+    neighbours: Count = 96
+    thin: Length | None = None
+    reflection_weight: Factor | None = None
+    tolerance: Length | None = None
 
 
 @options
@@ -88,8 +90,9 @@ class LightCodeOptions:
 class RefineOptions:
     """How strands are refined jointly after growth, in `steps` of Gauss-Newton.
 
-    Strands that add less than `marginal_coverage` per millimetre are removed; a measured line of
-    full confidence covers 1, a guessed millimetre 0.05. 0 keeps every strand.
+    Strands that add less than `marginal_coverage` per cell along them are removed; a measured line
+    of full confidence covers 1 of a cell (1 mm wide, or 0.8 of the distance between measured points
+    if that is less), a guess 0.05. 0 keeps every strand.
     """
 
     steps: Annotated[int, Field(ge=0, le=20)] = 3
@@ -105,19 +108,20 @@ class RefineOptions:
 class ReconstructOptions:
     """Options of a reconstruction.
 
-    `held_out` cameras are not used. `grid` is the voxels' edge; `roots` strands are grown from the
-    scalp, then gaps are filled. `max_length` is the hair's. `margin` is the envelope's extent in
-    front of the visible surface. `scalp_points` is a file of digitised scalp points to fit a head
-    to, `head_mesh` (OBJ) the head to fit instead of the generic one. Gaps are filled `within`
-    metres of a measurement (None: 3 mm or two voxels, on a hull 12 mm); give more for wider pixels.
+    `held_out` cameras are not used. `grid` is the voxels' edge (None: 5/3 pixels, 1 to 2 mm);
+    `roots` strands are grown from the scalp, then gaps are filled. `max_length` is the hair's.
+    `margin` is the envelope's extent in front of the visible surface (None: 1.1 pixels).
+    `scalp_points` is a file of digitised scalp points to fit a head to, `head_mesh` (OBJ) the head
+    to fit instead of the generic one. Gaps are filled `within` metres of a measurement (None: 3 mm
+    or two voxels, on a hull 12 mm); give more for wider pixels.
     `radius` of the strands; None keeps a head of hair's coverage.
     """
 
     held_out: tuple[str, ...] = ()
-    grid: Length = 2e-3
+    grid: Length | None = None
     roots: Annotated[int, Field(ge=1, le=1_000_000)] = 8000
     max_length: Length = 0.3
-    margin: Factor = 2e-3
+    margin: Factor | None = None
     scalp_points: str | None = None
     head_mesh: str | None = None
     within: Length | None = None

@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture
+from reconstruction.capture_scale import RESOLVED, CaptureScale
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.hair_envelope import build_envelope
@@ -26,6 +27,7 @@ from reconstruction.report.progress import part_of
 from reconstruction.report.report import Progress, Report, Stage
 from reconstruction.tangents.estimate import Measured, measure_tangents
 
+_COARSE = 8e-3  # metres: voxels of a hull that only measures the distance
 LEAST_CONFIDENCE = 0.1  # of a measured tangent to count
 
 
@@ -146,8 +148,28 @@ class MeasuringStages(Stages):
             masked, mesh, self.report, method=method, options=options, progress=self.progress
         )
 
+    def scale(
+        self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None
+    ) -> CaptureScale:
+        """The lengths that the capture resolves: at its points, else at the head or the hull."""
+        with self.report.stage("scale") as stage:
+            if len(cloud):
+                at: AnyFloats = cloud.points
+            elif head is not None:
+                at = head.mesh.vertices
+            else:
+                at = masked.subject_hull(_COARSE).centers()
+            scale = CaptureScale.of(masked.cameras, at, self.options)
+            stage.figures.update(scale.figures())
+            self.progress(
+                f"pixels of {1e3 * scale.pixel:.2g} mm: hairs closer than "
+                f"{1e3 * RESOLVED * scale.pixel:.2g} mm cannot be separated",
+                0.0,
+            )
+        return scale
+
     def envelope(
-        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh
+        self, masked: MaskedCapture, cloud: PointCloud, head: Mesh, scale: CaptureScale
     ) -> tuple[VoxelGrid, dict[str, Array]]:
         """The volume that can contain hair, and the depth `(H, W)` of each camera's hair pixels."""
         o = self.options
@@ -156,22 +178,28 @@ class MeasuringStages(Stages):
                 masked,
                 cloud,
                 head,
-                grid=o.grid,
-                margin=o.margin,
+                grid=scale.grid,
+                margin=scale.margin,
                 stage=stage,
                 longest=o.max_length,
             )
 
     def tangents(
-        self, masked: MaskedCapture, cloud: PointCloud, depths: dict[str, Array]
+        self,
+        masked: MaskedCapture,
+        cloud: PointCloud,
+        depths: dict[str, Array],
+        scale: CaptureScale,
     ) -> Measured:
         """The measured tangents."""
         with self.report.stage("orientation") as stage:
             return measure_tangents(
-                masked, cloud.points, depths, self.options.measure, stage, self.progress
+                masked, cloud.points, depths, scale, self.options.measure, stage, self.progress
             )
 
-    def surface(self, measured: Measured, cloud: PointCloud) -> list[AnyFloats]:
+    def surface(
+        self, measured: Measured, cloud: PointCloud, scale: CaptureScale
+    ) -> list[AnyFloats]:
         """Unrooted polylines `(N, 3)` through the measured lines."""
         with self.report.stage("surface") as stage:
             if not len(cloud):
@@ -183,7 +211,7 @@ class MeasuringStages(Stages):
                 return []
             self.progress("tracing the surface", 0.0)
             o = self.options
-            surface = SurfaceOptions(apart=o.measure.thin, longest=o.max_length)
+            surface = SurfaceOptions(apart=scale.thin, longest=o.max_length)
             good = measured.where(measured.confidence >= LEAST_CONFIDENCE)
             polylines = surface_strands(good, surface, seed=o.seed)
             stage.figures.update(strands=len(polylines), options=asdict(surface))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array
+from reconstruction.capture_scale import pixel_size
 from reconstruction.evaluation.baselines import with_true_directions
 from reconstruction.evaluation.connectivity import spread
 from reconstruction.evaluation.matching import StrandComparison, compare_strands
@@ -19,7 +20,6 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.closest_point import ClosestPoint
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.strands import Strands
-from reconstruction.growth.hair_envelope import pixel_size
 from reconstruction.report.report import Progress, silent
 
 ROOTED = 5e-3  # metres: largest distance of a rooted strand from the scalp

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -137,11 +136,6 @@ def _shown(hull: VoxelGrid, masked: MaskedCapture) -> tuple[Bools, Bools]:
     hair, skin = np.zeros((2, *hull.inside.shape), bool)
     hair[hull.inside], skin[hull.inside] = votes > 0, votes < 0
     return hair, skin
-
-
-def pixel_size(cameras: Sequence[Camera], middle: Array) -> float:
-    """Metres that one pixel spans at `middle (3,)`, the median over the cameras."""
-    return float(np.median([c.project(middle[None])[1][0] / c.K[0, 0] for c in cameras]))
 
 
 def _holding(grid: VoxelGrid, points: Array) -> Bools:

@@ -21,6 +21,7 @@ from reconstruction.model import Model
 from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.report import Progress, Report
 
+_HULL_GRID = 2e-3  # metres
 UNLIKE_MM = 3.0  # RMS of a face's points from the posed template; another head has 5
 
 
@@ -54,7 +55,7 @@ class Heads:
         with self.report.stage("head") as stage:
             self.progress("fitting a head to the face", 0.0)
             try:
-                points = lit_skin_points(masked, masked.subject_hull(self.options.grid))
+                points = lit_skin_points(masked, masked.subject_hull(_HULL_GRID))
                 seed = self.options.seed
                 head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
                 off = stage.figures["posed_rms_mm"]

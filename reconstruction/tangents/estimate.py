@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.records import CaptureError
+from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, texture
 from reconstruction.masks import MaskedCapture
-from reconstruction.reconstruct_options import MeasureOptions
+from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
@@ -24,20 +26,28 @@ from reconstruction.tangents.line_evidence import (
     half_sphere,
     line_scores,
     line_support,
-    pool,
     visible_from,
 )
+from reconstruction.tangents.pooling import NEIGHBOURS, agreement, chosen, pool
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
     OlatStack,
+    learned,
     observe,
-    reflection_scores,
     surface_normals,
 )
 
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
+TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
 ROUNDS = 2  # of the reflection table, filled from the directions of the round before
+BANK = LogGaborBank(wavelength=4.0, count=24, spread=1.5)
+"""Its wavelength is the shortest, whose scores are the yardstick for longer ones."""
+WAVELENGTHS = (4.0, 6.0, 8.0, 12.0)
+TEXTURE_SCALE = 0.65
+"""Wavelengths of the filters in the local mean's deviation."""
+WAVELENGTH_GROUPS, PATCHES, PATCH = 4, 40, 150
+"""Groups of lights by which wavelengths are compared, at so many patches of so many points."""
 LIGHT_GROUPS = 24  # groups of neighbouring lights, each with a texture of its own
 
 
@@ -114,10 +124,54 @@ class Saturation:
             )
 
 
+@dataclass(frozen=True)
+class Views:
+    """What `visible (N, C)` cameras show of `points (N, 3)` under lights by `names`.
+
+    `group (L,)` numbers the group of each light.
+    """
+
+    masked: MaskedCapture
+    cameras: Sequence[Camera]
+    names: Sequence[str]
+    group: Ints
+    points: Array
+    visible: Bools
+
+    def bank(self, spacing: float, candidates: Array, progress: Progress) -> LogGaborBank:
+        """Filters of the wavelength in whose texture half of the cameras predicts the other best.
+
+        The directions that one half scores highest are looked up, as in `pooling.chosen`, in the
+        other half's scores at the shortest wavelength, which blur least. Only some points and
+        lights are used. Ties and flat images go to the shortest.
+        """
+        rows = np.linspace(0, len(self.points) - 1, PATCHES).astype(np.int64)
+        near = cKDTree(self.points).query(self.points[rows], k=min(PATCH, len(self.points)))[1]
+        some = np.unique(near)
+        points, visible = self.points[some], self.visible[some]
+        groups = np.linspace(0, self.group.max(), WAVELENGTH_GROUPS).astype(np.int64)
+        few = np.flatnonzero(np.isin(self.group, groups))
+        names = [self.names[int(i)] for i in few]
+        halves = np.zeros((len(WAVELENGTHS), 2, len(some), len(candidates)), np.float32)
+        for k, camera in enumerate(self.cameras):
+            progress("line width", 0.0)
+            mask = self.masked.masks[camera.name].hair
+            stack = read_olat(self.masked.capture, camera, names)
+            for scores, wavelength in zip(halves, WAVELENGTHS, strict=True):
+                details = _details(stack, mask, self.group[few], TEXTURE_SCALE * wavelength)
+                support = line_support(responses(replace(BANK, wavelength=wavelength), details))
+                evidence = LineEvidence.of(camera, support, points, visible[:, k])
+                scores[k % 2, evidence.index] += line_scores(evidence, candidates)
+        table = pool(points, 4 * spacing, NEIGHBOURS)
+        found = [agreement((table @ h[0], table @ h[1]), halves[0]) for h in halves]
+        return replace(BANK, wavelength=WAVELENGTHS[int(np.argmax(found))])
+
+
 def measure_tangents(
     masked: MaskedCapture,
     points: Array,
     depths: Mapping[str, Array],
+    scale: CaptureScale,
     options: MeasureOptions = MeasureOptions(),
     stage: Stage | None = None,
     progress: Progress = silent,
@@ -139,28 +193,37 @@ def measure_tangents(
     if not len(points):
         lifted = [_lifted(*view) for view in zip(cameras, shown, strict=True)]
         points = np.concatenate(lifted) if lifted else points
-    points, visible = _visible(thinned(points, options.thin), cameras, shown, options.tolerance)
+    points, visible = _visible(thinned(points, scale.thin), cameras, shown, scale.tolerance)
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
     reads = len(lights) >= FEWEST_LIGHTS
     normals = _normals(points, cameras, visible) if reads else None
     candidates = half_sphere(CANDIDATES)
-    scores = np.zeros((len(points), CANDIDATES), np.float32)
+    views = Views(masked, cameras, names, group, points, visible)
+    bank = options.bank or views.bank(scale.thin, candidates, progress)
+    texture_scale = options.texture_scale or TEXTURE_SCALE * bank.wavelength
+    stage.figures["wavelength_px"] = bank.wavelength
+    halves = np.zeros((2, len(points), CANDIDATES), np.float32)  # by every other camera
     evidences, observations, saturation = [], [], Saturation()
     for k, camera in enumerate(cameras):  # the frames of one camera at a time bound memory
         progress("texture", 0.6 * k / len(cameras))
         mask = masked.masks[camera.name].hair
         stack = read_olat(capture, camera, names)
         saturation.add(stack, mask)
-        support = line_support(responses(options.bank, _details(stack, mask, group, options)))
+        details = _details(stack, mask, group, texture_scale)
+        support = line_support(responses(bank, details))
         evidences.append(LineEvidence.of(camera, support, points, visible[:, k]))
-        scores[evidences[-1].index] += line_scores(evidences[-1], candidates)
+        halves[k % 2, evidences[-1].index] += line_scores(evidences[-1], candidates)
         if normals is not None:
             observations.append(observe(stack, lights, points, normals, visible[:, k]))
         del stack, support  # before the next camera's are read
     saturation.record(stage)
     stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
-    tangents = decide(pool(points, options.radius, options.neighbours) @ scores, candidates)
+    given = (options.radius, options.reflection_weight)
+    found = chosen(points, scale.thin, halves, None, *given)
+    stage.figures["texture_radius_mm"] = 1e3 * found.radius
+    scores = halves.sum(axis=0)
+    tangents = decide(pool(points, found.radius, options.neighbours) @ scores, candidates)
     if not reads:
         stage.leave_out(
             "directions from reflection",
@@ -169,11 +232,20 @@ def measure_tangents(
         )
     else:
         progress("reflection", 0.6)
-        near = pool(points, options.reflection_radius, options.neighbours)
-        texture_only, scores = tangents, near @ scores
+        texture_only = tangents
         for _ in range(ROUNDS):
-            more, table = reflection_scores(observations, points, candidates, tangents)
-            tangents = decide(scores + options.reflection_weight * (near @ more), candidates)
+            table = learned(observations, tangents)
+            more = np.zeros_like(halves)
+            for k, o in enumerate(observations):
+                more[k % 2, o.index] += table.scores(o, points, candidates)
+            found = chosen(points, scale.thin, halves, more, *given)
+            near = pool(points, found.radius, options.neighbours)
+            total = more.sum(axis=0)
+            total *= np.float32(found.weight)
+            total += scores
+            tangents = decide(near @ total, candidates)
+            del more, total
+        stage.figures.update(radius_mm=1e3 * found.radius, reflection_weight=found.weight)
         turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
         stage.figures["lobe_contrast"] = table.contrast
         stage.figures["turned_by_reflection_deg"] = float(np.median(np.degrees(np.arccos(turned))))
@@ -192,10 +264,13 @@ def measure_tangents(
     return Measured(points, tangents.directions, tangents.confidence)
 
 
-def _details(stack: OlatStack, mask: Bools, group: Ints, options: MeasureOptions) -> Floats:
-    """Textures `(G, H, W)` of the hair under each group of captured lights, at least one."""
+def _details(stack: OlatStack, mask: Bools, group: Ints, scale: float) -> Floats:
+    """Textures `(G, H, W)` of the hair under each group of captured lights, at least one.
+
+    The local mean has `scale` pixels.
+    """
     details = [
-        texture(stack.olat[of].sum(axis=0), mask & whole, options.texture_scale)
+        texture(stack.olat[of].sum(axis=0), mask & whole, scale)
         for g in np.unique(group)
         if (of := (group == g) & stack.shot).any() and (whole := stack.known[of].all(axis=0)).any()
     ]
@@ -205,12 +280,20 @@ def _details(stack: OlatStack, mask: Bools, group: Ints, options: MeasureOptions
 def _visible(
     points: Array, cameras: Sequence[Camera], depths: Sequence[Array], tolerance: float
 ) -> tuple[Array, Bools]:
-    """Those of `points (N, 3)` that are visible in some camera, and in which, `(M, C)`."""
+    """Those of `points (N, 3)` that are visible in some camera, and in which, `(M, C)`.
+
+    A camera whose depth lies more than `TRANSPARENT` tolerances behind a point sees through it: it
+    shows something else there. Points that more cameras see through than see are dropped.
+    """
     visible = np.zeros((len(points), len(cameras)), bool)
+    through = np.zeros_like(visible)
     for k, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
         visible[:, k] = visible_from(camera, depth, points, tolerance)
-    any_one = visible.any(axis=1)
-    return points[any_one], visible[any_one]
+        nearer = np.where(depth > 0, np.maximum(depth - TRANSPARENT * tolerance, 0.0), 0.0)
+        through[:, k] = visible_from(camera, nearer, points, 0.0)
+    visible &= ~through
+    kept = visible.sum(axis=1) >= np.maximum(through.sum(axis=1), 1)
+    return points[kept], visible[kept]
 
 
 def _normals(points: Array, cameras: Sequence[Camera], visible: Bools) -> Array:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.cameras import Camera
@@ -109,25 +107,6 @@ def _line_scores(evidence: LineEvidence, candidates: Array) -> Floats:
     bins = np.rint(np.arctan2(v, u) * (count / np.pi)).astype(np.int64) % count
     sine2 = 1 - (rays.astype(np.float32) @ candidates.T.astype(np.float32)) ** 2
     return np.asarray(sine2 * np.take_along_axis(support, bins, axis=1), np.float32)
-
-
-def pool(points: AnyFloats, radius: float, most: int = 24) -> sparse.csr_array:
-    """Weights `(N, N)` that average over at most `most` neighbours within `radius` metres.
-
-    A Gaussian of half the radius; each row sums to 1. Single precision, as the scores are.
-    """
-    if not len(points):
-        return sparse.csr_array((0, 0), dtype=np.float32)
-    k = min(most, len(points))
-    distance, index = cKDTree(points).query(points, k=np.arange(1, k + 1))
-    weight = np.where(distance <= radius, np.exp(-2 * (distance / radius) ** 2), 0)
-    weight /= weight.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(points)), k)
-    table = sparse.csr_array(
-        (weight.astype(np.float32).ravel(), (rows, index.ravel())), shape=(len(points), len(points))
-    )
-    table.eliminate_zeros()
-    return table
 
 
 @dataclass(frozen=True, eq=False)

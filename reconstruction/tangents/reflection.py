@@ -210,16 +210,7 @@ class Reflection:
         return out
 
 
-def reflection_scores(
-    observations: Sequence[Observations], points: Array, candidates: Array, known: Tangents
-) -> tuple[Floats, Reflection]:
-    """Scores `(N, D)` of unit directions `candidates (D, 3)`, and the table behind them.
-
-    The most confident of the tangents `known` at `points (N, 3)` fill the table.
-    """
+def learned(observations: Sequence[Observations], known: Tangents) -> Reflection:
+    """The reflection table, filled from the most confident of the tangents `known`."""
     trusted = known.confidence >= np.quantile(known.confidence, 1 - _TRUSTED)
-    table = Reflection.learn(observations, known.directions, trusted)
-    scores = np.zeros((len(points), len(candidates)), np.float32)
-    for o in observations:
-        scores[o.index] += table.scores(o, points, candidates)
-    return scores, table
+    return Reflection.learn(observations, known.directions, trusted)

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from reconstruction import Camera, Capture, Model, Strands, read_strands
 from reconstruction.arrays import Array
+from reconstruction.capture_scale import pixel_size
 from reconstruction.evaluation.baselines import (
     baseline_hull,
     hull_smooth_field,
@@ -23,7 +24,6 @@ from reconstruction.evaluation.matching import compare_strands
 from reconstruction.evaluation.visibility import Visibility
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.growth.hair_envelope import pixel_size
 
 STEP = 5e-4
 """Metres between the points at which strands are cut at a ball's surface."""

@@ -226,6 +226,7 @@ def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
     assert [s.name for s in report.stages] == [
         "triangulation",
         "masks",
+        "scale",
         "envelope",
         "orientation",
         "surface",

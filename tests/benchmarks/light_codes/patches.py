@@ -97,7 +97,7 @@ def run_patch(
         }
         save(out / "patch.json", results)
     progress("baselines", 1 - part)
-    results["variants"] |= truth.baselines(Model(out / "photometric"), OPTIONS.grid)
+    results["variants"] |= truth.baselines(Model(out / "photometric"))
     save(out / "patch.json", results)
     plot_geometry(results["variants"], out / "patch.png")
     sets = {"true": truth.strands}

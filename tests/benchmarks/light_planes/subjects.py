@@ -30,7 +30,6 @@ from reconstruction import (
     write_strands,
 )
 from reconstruction.head.fit import HeadHints, fit_head
-from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
 from stage_service.cli.support.commands import rig_path
 
 CAMERAS = 8
@@ -38,23 +37,6 @@ PROJECTORS = [(180, 15), (300, 35), (60, 15), (0, 45), (120, 35), (240, 15)]
 """Azimuth from the front and elevation in degrees; a rig has the first three, or more."""
 WIDTH, HEIGHT, ROWS, LIGHTS = 320, 400, 256, 120
 DRIFT_MM = 4.0
-OPTIONS = ReconstructOptions(
-    grid=1.5e-3,
-    margin=1e-3,
-    roots=20000,
-    measure=MeasureOptions(
-        bank=LogGaborBank(wavelength=4.0, count=24, spread=1.5),
-        texture_scale=3.0,
-        radius=3e-3,
-        reflection_radius=3e-3,
-        neighbours=32,
-        thin=1.25e-3,
-        reflection_weight=1.5,
-        tolerance=1.5e-3,
-    ),
-)
-"""One setting for all subjects: finer than the defaults, whose pixels are twice as large."""
-
 _DISTANCE = 0.95
 
 
@@ -176,7 +158,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                 )
                 for drift in drifts
             ]
-            options = replace(OPTIONS, max_length=framing.longest)
+            options = ReconstructOptions(max_length=framing.longest)
         options = replace(options, seed=args.seed)
         if args.quick:
             options = replace(options, grid=4e-3, roots=500)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from reconstruction import Camera, Capture, Light
+from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.masks import HairMask, MaskedCapture
 from reconstruction.tangents.estimate import measure_tangents
@@ -107,8 +109,9 @@ def test_orientations_come_from_each_light_or_from_groups(
     points = np.stack([r * np.sin(a), -r * np.cos(a), z], axis=1)
     whole = np.ones((80, 80), bool)
     masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
-    depths = {c.name: np.full((80, 80), 1.0) for c in cameras}
-    found = measure_tangents(MaskedCapture(capture, masks), points, depths)
+    depths = {c.name: np.full((80, 80), 0.85) for c in cameras}
+    scale = replace(CaptureScale.of(cameras, points), tolerance=0.1)
+    found = measure_tangents(MaskedCapture(capture, masks), points, depths, scale)
     n = found.points / np.linalg.norm(found.points, axis=1, keepdims=True)
     t = UP - n[:, 2:] * n
     t /= np.linalg.norm(t, axis=1, keepdims=True)

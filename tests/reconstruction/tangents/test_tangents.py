@@ -10,6 +10,7 @@ import pytest
 
 from reconstruction import Camera, Light
 from reconstruction.geometry.lights import dome_positions
+from reconstruction.tangents.estimate import _visible
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
     Tangents,
@@ -18,14 +19,14 @@ from reconstruction.tangents.line_evidence import (
     half_sphere,
     line_scores,
     line_support,
-    pool,
     visible_from,
 )
+from reconstruction.tangents.pooling import pool
 from reconstruction.tangents.reflection import (
     OlatStack,
     Reflection,
+    learned,
     observe,
-    reflection_scores,
     surface_normals,
 )
 
@@ -135,6 +136,25 @@ def test_pooling_averages_over_near_points_only() -> None:
     assert table[2, 2] == 1
 
 
+def test_points_that_cameras_see_through_are_dropped() -> None:
+    """A point 3 cm in front of the surface that both cameras show behind it, and one on it."""
+    cameras = [camera((0.0, -1.0, 0.0)), camera((0.05, -1.0, 0.0))]
+    depths = [np.full((64, 64), 1.0)] * 2
+    points = np.array([[0.0, -0.03, 0.0], [0.0, 0.0, 0.0]])
+    kept, visible = _visible(points, cameras, depths, 2e-3)
+    np.testing.assert_array_equal(kept, points[1:])
+    assert visible.all()
+
+
+def test_a_fly_away_that_one_of_two_cameras_resolves_is_kept() -> None:
+    """It is visible in that camera only: the other shows the surface behind it."""
+    cameras = [camera((0.0, -1.0, 0.0)), camera((0.05, -1.0, 0.0))]
+    depths = [np.full((64, 64), 0.97), np.full((64, 64), 1.0)]
+    kept, visible = _visible(np.array([[0.0, -0.03, 0.0]]), cameras, depths, 2e-3)
+    assert len(kept) == 1
+    assert visible.tolist() == [[True, False]]
+
+
 def turning_patch(full: float = np.inf, missing: int = 0):
     """Points of a patch, their directions, which turn, and what two cameras saw of them.
 
@@ -173,6 +193,15 @@ def turning_patch(full: float = np.inf, missing: int = 0):
     every = np.ones(len(points), bool)
     normals = surface_normals(points, np.mean([c.center for c in cameras], axis=0) - points)
     return points, truth, [observe(p, lights, points, normals, every) for p in pictures]
+
+
+def reflection_scores(observed_directions, points, candidates, known):
+    """Scores of all cameras by the table that the known directions fill, and that table."""
+    table = learned(observed_directions, known)
+    scores = np.zeros((len(points), len(candidates)), np.float32)
+    for o in observed_directions:
+        scores[o.index] += table.scores(o, points, candidates)
+    return scores, table
 
 
 @pytest.mark.parametrize(("full", "missing"), [(np.inf, 0), (0.5, 0), (np.inf, 10)])

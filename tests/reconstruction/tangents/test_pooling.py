@@ -1,0 +1,80 @@
+"""The radius and weight that a capture's own cameras agree on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reconstruction.tangents.line_evidence import decide, half_sphere
+from reconstruction.tangents.pooling import MOST_RADIUS, chosen, pool
+
+SPACING = 5e-4
+
+
+def plane(side: int = 40) -> np.ndarray:
+    """Points of a plane, `SPACING` apart."""
+    x, y = np.meshgrid(*[SPACING * np.arange(side)] * 2)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def halves(truth: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
+    """Scores `(2, N, D)` of directions by two sets of cameras, of independent noise."""
+    rng = np.random.default_rng(seed)
+    clean = (half_sphere(200) @ truth.T).T ** 2
+    return (clean + noise * rng.standard_normal((2, *clean.shape))).astype(np.float32)
+
+
+def turning(points: np.ndarray, period: float) -> np.ndarray:
+    """Directions in the plane that turn by half a turn over `period` metres."""
+    angle = np.pi * points[:, 0] / period
+    return np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+
+def error(points: np.ndarray, radius: float, scores: np.ndarray, truth: np.ndarray) -> float:
+    """Median degrees between pooled directions and true ones."""
+    found = decide(pool(points, radius, 96) @ scores.sum(axis=0), half_sphere(200)).directions
+    cosine = np.abs((found * truth).sum(axis=1)).clip(0, 1)
+    return float(np.degrees(np.median(np.arccos(cosine))))
+
+
+def test_straight_noisy_hair_is_averaged_widely_and_turning_hair_narrowly() -> None:
+    points = plane()
+    straight = chosen(points, SPACING, halves(turning(points, 1e3), 3.0), None)
+    curled = chosen(points, SPACING, halves(turning(points, 4e-3), 0.5), None)
+    assert straight.radius >= 4 * SPACING
+    assert curled.radius <= 3 * SPACING
+    assert straight.weight == curled.weight == 0
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 3.0])
+def test_the_radius_is_near_the_best_that_the_truth_would_choose(noise: float) -> None:
+    points = plane()
+    truth = turning(points, 8e-3)
+    scores = halves(truth, noise)
+    found = chosen(points, SPACING, scores, None)
+    errors = [error(points, k * SPACING, scores, truth) for k in (1, 1.5, 2, 3, 4, 6, 8)]
+    assert error(points, found.radius, scores, truth) < 1.25 * min(errors) + 1.0
+
+
+def test_evidence_of_noise_gets_no_weight_and_the_other_all() -> None:
+    points = plane()
+    truth = turning(points, 20e-3)
+    good, noise = halves(truth, 0.3), halves(truth, 1e3, seed=1)
+    assert chosen(points, SPACING, good, noise / 1e3).weight <= 0.15
+    assert chosen(points, SPACING, noise / 1e3, good).weight >= 3.0
+
+
+def test_given_values_stay() -> None:
+    points = plane(10)
+    scores = halves(turning(points, 8e-3), 0.5)
+    found = chosen(points, SPACING, scores, scores, radius=7e-4, weight=2.5)
+    assert (found.radius, found.weight) == (7e-4, 2.5)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_points_and_flat_scores_still_give_a_radius(count: int) -> None:
+    points = plane(2)[:count]
+    flat = np.zeros((2, count, 200), np.float32)
+    found = chosen(points, 1.0, flat, flat)
+    assert 0 < found.radius <= MOST_RADIUS
+    assert np.isfinite(found.agreement)
