@@ -33,19 +33,21 @@ def baseline_hull(
     head: Mesh | None = None,
     *,
     spacing: float = 2e-3,
+    bounds: Array | None = None,
 ) -> VoxelGrid:
     """The possible volume of hair from `masks[camera.name] (H, W)` of the hair and a head.
 
     The visual hull of hair and head, without the head's inside and without voxels in front of
-    pixels that show no hair. Without a head, the visual hull of the masks.
+    pixels that show no hair. Without a head, the visual hull of the masks. Within `bounds (2, 3)`,
+    metres; None: where cameras see.
     """
     if head is None:
-        return visual_hull(cameras, masks, spacing=spacing)
+        return visual_hull(cameras, masks, spacing=spacing, bounds=bounds)
     used = [c for c in cameras if c.name in masks]
     both = {
         c.name: trim_edges(masks[c.name] | mesh_silhouette(c, head), masks[c.name]) for c in used
     }
-    hull = visual_hull(used, both, spacing=spacing)
+    hull = visual_hull(used, both, spacing=spacing, bounds=bounds)
     hull = replace(hull, inside=hull.inside & ~inside_mesh(hull, head))
     first = {c.name: np.where(masks[c.name], 0.0, mesh_depth(c, head)) for c in used}
     return space_carve(hull, used, first)

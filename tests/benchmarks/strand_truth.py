@@ -134,8 +134,14 @@ class StrandTruth:
         """
         capture = self._capture
         masks = {c.name: model.mask(c.name, "hair", capture) for c in capture.rig.cameras}
-        hull = baseline_hull(capture.rig.cameras, masks, capture.head, spacing=spacing)
-        if self._ball is not None:  # cameras that see a patch bound no hull elsewhere
+        bounds = None  # cameras that see a patch bound no hull
+        if self._ball is not None:
+            reach = self._ball.radius + 2 * spacing
+            bounds = np.array(self._ball.center) + reach * np.array([[-1.0], [1.0]])
+        hull = baseline_hull(
+            capture.rig.cameras, masks, capture.head, spacing=spacing, bounds=bounds
+        )
+        if self._ball is not None:
             hull = self._ball.within(hull, spacing)
         pixel = pixel_size(capture.rig.cameras, self.strands.points.mean(axis=0, dtype=float))
         ours = model.strands() if self._ball is None else self._ball.cut(model.strands())
