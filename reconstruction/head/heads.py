@@ -55,7 +55,8 @@ class Heads:
         with self.report.stage("head") as stage:
             self.progress("fitting a head to the face", 0.0)
             try:
-                points = lit_skin_points(masked, masked.subject_hull(_HULL_GRID))
+                grid = self.options.grid or _HULL_GRID
+                points = lit_skin_points(masked, masked.subject_hull(grid))
                 seed = self.options.seed
                 head = fit_capture_head(points, self.options.head_mesh, stage, seed=seed)
                 off = stage.figures["posed_rms_mm"]

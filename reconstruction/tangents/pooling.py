@@ -20,6 +20,9 @@ WEIGHTS = (0.0, 0.15, 0.3, 0.5, 0.8, 1.5, 3.0, 6.0)
 MOST_RADIUS = 10e-3
 """Metres: hair turns within a centimetre."""
 
+UNKNOWN_RADIUS, UNKNOWN_WEIGHT = 4.0, 0.5
+"""Spacings and weight where no point is visible to both halves of the cameras."""
+
 NEIGHBOURS = 96
 _SAMPLE = 3000  # points at which choices are compared
 
@@ -74,7 +77,16 @@ def chosen(
     weighted, scores highest is looked up in the other half at the point itself: too small a radius
     leaves noise, too large a one blurs hair that turns. The agreement is the mean score there in
     standard deviations, summed over both kinds; 0 by chance. A given `radius` or `weight` stays.
+
+    Without a point that both halves score, the agreement is 0 and `UNKNOWN_RADIUS` and
+    `UNKNOWN_WEIGHT` are taken. Raises `ValueError` for scores that are not finite.
     """
+    if not texture.any(axis=2).all(axis=0).any():
+        return Pooling(
+            radius or min(UNKNOWN_RADIUS * spacing, MOST_RADIUS),
+            UNKNOWN_WEIGHT if weight is None else weight,
+            0.0,
+        )
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64))
     radii = [r * spacing for r in RADII if r * spacing <= MOST_RADIUS] or [MOST_RADIUS]
     weights = WEIGHTS if weight is None else (weight,)
@@ -102,6 +114,8 @@ def agreement(pooled: Sequence[Floats], own: Sequence[Floats]) -> float:
     total = 0.0
     for scores, others in zip(pooled, reversed(own), strict=True):
         spread = float(others.std())
+        if not np.isfinite(spread):
+            raise ValueError("scores must be finite: check the frames for pixels without a number")
         there = others[np.arange(len(others)), scores.argmax(axis=1)] - others.mean(axis=1)
         total += float(there.mean()) / spread if spread > 0 else 0.0
     return total

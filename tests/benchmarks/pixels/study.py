@@ -7,8 +7,8 @@ picture of its strands beside the truth, `pixels.json` and the table `pixels.md`
 from __future__ import annotations
 
 import argparse
-import resource
 import time
+from pathlib import Path
 from typing import Any
 
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, option, within
@@ -32,6 +32,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Every subject of `SUBJECTS` at every pitch, by each method, and the baselines."""
     if args.only not in (None, *SUBJECTS):
         raise LeftOut(f"no subject {args.only!r}; there are {', '.join(SUBJECTS)}")
+    if not all(PITCHES[-1] / 4 <= 1e-3 * p <= 4 * PITCHES[0] for p in args.pitches):
+        raise LeftOut(f"pitches {args.pitches}: expected millimetres from 0.06 to 7")
     names = [n for n in SUBJECTS if args.only in (None, n)]
     pitches = sorted((1e-3 * p for p in args.pitches), reverse=True)
     if args.quick:
@@ -70,7 +72,7 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
             **truth.score(model.strands()),
             "seconds": time.perf_counter() - begin[0],
             "cpu_seconds": time.process_time() - begin[1],
-            "process_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+            "peak_gb": max(s.peak_gb or 0.0 for s in report.stages),
             "stages": {s.name: s.seconds for s in report.stages},
             "scale": report["scale"].figures,
             "tangents": {
@@ -84,7 +86,7 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
     return variants
 
 
-def _picture(out: Any, capture: Capture, truth: StrandTruth, model: Model, ball: Ball) -> None:
+def _picture(out: Path, capture: Capture, truth: StrandTruth, model: Model, ball: Ball) -> None:
     sets = {"true": truth.strands, "reconstructed": ball.cut(model.strands())}
     picture_strands(out / "strands.png", capture.rig.cameras[0], sets)
 

@@ -118,6 +118,11 @@ def test_baseline_hull_leaves_out_the_head_and_what_is_before_its_face(
     assert not hull.contains(ball(0.055).vertices).any()
     assert not hull.contains(np.array([0, -0.064, 0])).any()
     assert hull.contains(np.array([0, 0.1, 0.03])).all()
+    bounds = np.array([[-0.02, 0.07, 0.0], [0.02, 0.11, 0.05]])
+    part = baseline_hull(cameras, masks, head, spacing=3e-3, bounds=bounds)
+    assert part.contains(np.array([0, 0.1, 0.03])).all()
+    centers = part.centers()
+    assert ((centers >= bounds[0] - 3e-3) & (centers <= bounds[1] + 3e-3)).all()
 
 
 @pytest.fixture(scope="module")

@@ -78,3 +78,19 @@ def test_few_points_and_flat_scores_still_give_a_radius(count: int) -> None:
     found = chosen(points, 1.0, flat, flat)
     assert 0 < found.radius <= MOST_RADIUS
     assert np.isfinite(found.agreement)
+
+
+def test_cameras_that_share_no_point_leave_the_usual_radius_and_weight() -> None:
+    """Every score of the second half is 0: there is nothing to predict."""
+    points = plane(10)
+    scores = halves(turning(points, 8e-3), 0.5)
+    scores[1] = 0
+    found = chosen(points, SPACING, scores, scores)
+    assert (found.radius, found.weight, found.agreement) == (4 * SPACING, 0.5, 0.0)
+
+
+def test_scores_that_are_not_numbers_are_refused() -> None:
+    points = plane(10)
+    scores = np.full((2, len(points), 200), np.nan, np.float32)
+    with pytest.raises(ValueError, match="must be finite"):
+        chosen(points, SPACING, scores, None)
