@@ -28,7 +28,8 @@ class Admission:
 
     def judge(self, head: bytes, address: str) -> Verdict:
         """The verdict on a connection that begins with `head`, empty if it is encrypted."""
-        request, headers = _parsed(head)
+        method, path, headers = _parsed(head)
+        request = f"{method} {self._access.inner(path)}"
         stop = STOP.fullmatch(request)
         stops = stop is not None and stop[1] in (None, self._running())
         identity = self._access.identity(headers)
@@ -40,7 +41,7 @@ class Admission:
             owner,
             at_once=owner.steers or (stops and identity is not None),
             may=lambda: express or self._hall.lacks(owner) is None,
-            refusal=lambda: self._refusal(owner, request.partition(" ")[2]),
+            refusal=lambda: self._refusal(owner, path),
         )
 
     def _refusal(self, owner: Owner, path: str) -> bytes:
@@ -55,11 +56,10 @@ class Admission:
         return b"".join([status, *lines, b"\r\n", bytes(response.body)])
 
 
-def _parsed(head: bytes) -> tuple[str, Headers]:
-    """Method and path of a request as `STOP` has them, and its headers; the server rejects what
-    cannot be parsed."""
+def _parsed(head: bytes) -> tuple[str, str, Headers]:
+    """Method, path and headers of a request; the server rejects what cannot be parsed."""
     first, *lines = head.partition(b"\r\n\r\n")[0].split(b"\r\n")
-    words = first.decode("latin-1").split(" ")
+    method, _, target = first.decode("latin-1").partition(" ")
     pairs = (line.partition(b":") for line in lines)
     headers = Headers(raw=[(name.lower(), value.strip()) for name, _, value in pairs])
-    return " ".join(words[:2]).partition("?")[0], headers
+    return method, target.partition(" ")[0].partition("?")[0], headers

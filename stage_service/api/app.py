@@ -47,6 +47,7 @@ from stage_service.api.gate import OWN_NAMES, Access, Gate
 from stage_service.api.lanes import Lanes
 from stage_service.api.places import Places
 from stage_service.api.porch import Porch
+from stage_service.api.prefix import Prefixed
 from stage_service.api.problems import PAGE, Faults, Problem, errors_page, install_problems
 from stage_service.api.throttle import Throttle
 from stage_service.records.refusals import Refusals
@@ -76,9 +77,11 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
         finally:
             service.close()
 
+    access = access or Access()
     app = FastAPI(
         title="hairstage",
         version=version("hairstage"),
+        servers=[{"url": access.prefix}] if access.prefix else None,
         summary="Runs a hair light stage and turns its captures into strands and relit hair.",
         lifespan=lifespan,
         docs_url=None,
@@ -90,7 +93,6 @@ def create_app(service: Service, access: Access | None = None) -> FastAPI:
             }
         },
     )
-    access = access or Access()
     app.state.service, app.state.lanes, app.state.access = service, Lanes(), access
     app.state.feed, app.state.viewing = event_stream.Feed(service.events), service.viewing
     for part in (routes, steering, queueing, store, calibration, event_stream):
@@ -131,7 +133,9 @@ def _completed(
     app.add_middleware(Heads)
     app.add_middleware(Entrance, running=running)
     app.add_middleware(Gate, access=access, refusals=refusals)
-    app.add_middleware(SafeHeaders)  # outermost: responses of the gate have them too
+    app.add_middleware(SafeHeaders)  # outside: responses of the gate have them too
+    if access.prefix:
+        app.add_middleware(Prefixed, access=access)
     return app
 
 
@@ -288,7 +292,7 @@ def serve(
     """
     with listening(endpoint.host, endpoint.port, endpoint.socket) as listener:
         allow_files()
-        url = endpoint.url(0 if endpoint.socket else listener.getsockname()[1])
+        url = endpoint.url(0 if endpoint.socket else listener.getsockname()[1]) + access.prefix
         app = create_app(service, access)
         config = uvicorn.Config(
             app,

@@ -24,6 +24,7 @@ from stage_service.records.tokens import SCOPES, Identity, Tokens, UnknownToken
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 VIEW, VIEW_PAGE = "/view", "/view/page/"
 ANYBODY = Identity(name="", scopes=SCOPES)
+PROXY = "A proxy in between has to pass on the Host; for nginx: proxy_set_header Host $http_host;"
 DARK = ("POST", "/devices/blackout")
 """The only request allowed by a page's blackout right."""
 NAMES = {"/devices/blackout": "blackout", "/login": "login"}
@@ -33,12 +34,19 @@ NAMES = {"/devices/blackout": "blackout", "/login": "login"}
 @dataclass(frozen=True)
 class Access:
     """Access by `names`, the service's host names in lower case, and by `tokens`, sent with each
-    request or once to log in; None admits everybody."""
+    request or once to log in; None admits everybody. `prefix` is the path, such as "/stage", under
+    which a proxy serves it."""
 
     tokens: Tokens | None = None
     names: frozenset[str] = OWN_NAMES
     logins: Logins = field(default_factory=Logins)
     attempts: Attempts = field(default_factory=Attempts)
+    prefix: str = ""
+
+    def inner(self, path: str) -> str:
+        """A request's path without the prefix, which a proxy may have removed."""
+        rest = path.removeprefix(self.prefix)
+        return path if rest[:1] not in ("", "/") else rest or "/"
 
     def refusal(self, headers: Headers) -> tuple[str, str, int | None] | None:
         """Kind, detail and status of a problem if a foreign web page may have caused the request.
@@ -48,11 +56,15 @@ class Access:
         """
         host = headers.get("host", "")
         if _name(host).lower() not in self.names:
-            return "http", f"host {host!r} is not a name of this service", 421
+            return "http", f"host {host!r} is not a name of this service: see --name", 421
         own = {f"{scheme}://{host}" for scheme in ("http", "https")}
         for origin in headers.getlist("origin"):
             if origin not in own:
-                return "foreign-origin", f"requests from pages of {origin!r} are refused", None
+                detail = (
+                    f"requests from pages of {origin!r} are refused, because the request's Host is "
+                    f"{host!r}. {PROXY}"
+                )
+                return "foreign-origin", detail, None
         return None
 
     def identity(self, headers: Headers, secure: bool = False) -> Identity | None:
@@ -63,7 +75,8 @@ class Access:
         if "authorization" in headers:
             kind, _, token = headers["authorization"].partition(" ")
             return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
-        behind = self.logins.tokens_of(cookies(headers, secure), place(headers))
+        held = cookies(headers, secure, self.prefix)
+        behind = self.logins.tokens_of(held, place(headers))
         return next(filter(None, map(self.tokens.behind, behind)), None)
 
     def darkens(self, headers: Headers) -> Identity | None:
@@ -129,6 +142,8 @@ class Gate:
                 "log in again: the request has neither the header 'Authorization: Bearer TOKEN' "
                 "with a valid token, nor the cookie of a valid login"
             )
+            if route is None:
+                detail += f"; there is no path {scope['path']!r}: see --root-path for proxies"
             return "unauthorized", detail, None
         if route is not None and route.scopes and not route.allows(identity.scopes):
             needed = " or ".join(map(repr, route.scopes))

@@ -20,6 +20,8 @@ from stage_service.records import logins
 from stage_service.records.tokens import Identity, Scope, UnknownToken
 
 LOGIN = "/login"
+PAGE_PATH = "Hairstage-Path"
+"""The header with the path of the page that logs in."""
 
 
 class LoginRequest(BaseModel):
@@ -43,14 +45,22 @@ open_to_all = APIRouter(tags=["login"])
 router = APIRouter(tags=["login"])
 
 
-@open_to_all.post(LOGIN)
+@open_to_all.post(LOGIN, response_model=Who)
 async def log_in(
     body: LoginRequest, request: Request, response: Response, service: OnService
-) -> Who:
+) -> Who | Response:
     """Log a browser in by a token, for 12 hours. The cookie represents the token; only this
     service's pages send it, and scripts cannot read it. After several wrong tokens further logins
     from that address are refused for some time (429, `Retry-After`)."""
     access = request.app.state.access
+    here = f"{access.prefix}/"
+    if (opened := request.headers.get(PAGE_PATH, here)) != here:
+        option = f"with --root-path {opened[:-1]}" if opened != "/" else "without --root-path"
+        detail = (
+            f"this page was opened at the path {opened!r}, but the service is at {here!r}: open it "
+            f"there, or start 'hairstage serve' {option}"
+        )
+        return problem_response(request.url.path, "http", detail, status=421)
     if access.tokens is None:
         return _who(request, access.of_token(body.token))
     origin = _origin(request)
@@ -78,7 +88,8 @@ async def log_out(
     request: Request, response: Response, by: Anybody, service: OnService
 ) -> Who | Response:
     """End the login and invalidate its cookie. The blackout right stays."""
-    access, held = request.app.state.access, cookies(request.headers, _secure(request))
+    access = request.app.state.access
+    held = cookies(request.headers, _secure(request), access.prefix)
     result: Who | Response = _who(request, by)
     try:
         await run_in_threadpool(access.logins.end, held, place(request.headers))
@@ -109,10 +120,10 @@ def place(headers: Headers) -> str:
     return headers.get("host", "").lower()
 
 
-def cookies(headers: Headers, secure: bool) -> list[str]:
+def cookies(headers: Headers, secure: bool, prefix: str) -> list[str]:
     """Values of a request's login cookies, in order: another port of the host may have set one of
     the same name with a longer path, which comes first."""
-    name = _name(headers, secure)
+    name = _name(headers, secure, prefix)
     parts = [part.strip() for line in headers.getlist("cookie") for part in line.split(";")]
     return [value for part in parts for key, _, value in [part.partition("=")] if key == name]
 
@@ -127,14 +138,16 @@ def _cookie(request: Request, held: str, seconds: float) -> str:
     """`Set-Cookie`; an empty value removes the cookie."""
     over_tls = "; Secure" if _secure(request) else ""
     rules = f"Path=/; Max-Age={seconds:.0f}; HttpOnly; SameSite=Strict{over_tls}"
-    return f"{_name(request.headers, _secure(request))}={held}; {rules}"
+    prefix = request.app.state.access.prefix
+    return f"{_name(request.headers, _secure(request), prefix)}={held}; {rules}"
 
 
-def _name(headers: Headers, secure: bool) -> str:
-    """The cookie's name, with the port, because browsers share cookies between ports. Over TLS the
-    prefix `__Host-` binds it to this host."""
+def _name(headers: Headers, secure: bool, prefix: str) -> str:
+    """The cookie's name, with port and path prefix, because browsers share cookies between ports.
+    Over TLS it begins with `__Host-`, which binds it to this host."""
     port = headers.get("host", "").rpartition(":")[2]
     name = f"hairstage-{port}" if port.isdigit() else "hairstage"
+    name += prefix.replace("/", ".")
     return f"__Host-{name}" if secure else name
 
 

@@ -222,7 +222,8 @@ async def get_artifact(
     file = await lanes.jobs(service.jobs.artifact, job, path)
     if path == PAGE:
         response = file_response(file, "text/html; charset=utf-8")
-        folder = request.url.path.removesuffix(PAGE)
+        prefix = request.app.state.access.prefix
+        folder = prefix + request.url.path.removesuffix(PAGE)
         response.headers.update(report_policy(request.headers["host"], quote(folder)))
         return response
     kind, headers = await run_in_threadpool(presented, file)

@@ -57,6 +57,9 @@ def add(commands: Commands) -> None:
         "--name", action="append", default=[], help="a further host name of this service"
     )
     serve.add_argument(
+        "--root-path", default="", help="path under which a proxy serves it, such as /stage"
+    )
+    serve.add_argument(
         "--take-over", action="store_true", help="take the stage from a service that has died"
     )
     serve.add_argument(
@@ -104,6 +107,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
     """
     log_to_stderr(args.log_json)
     from stage_service.api.app import Endpoint, serve
+    from stage_service.api.prefix import checked
     from stage_service.captures.stage import put_off
     from stage_service.config import load_rig_file
     from stage_service.devices.ownership import StageInUse
@@ -119,6 +123,7 @@ def run_serve(args: argparse.Namespace, output: Output) -> None:
             "leave out --no-auth, and give --tls-cert and --tls-key"
         )
     _check_certificate(args)
+    args.root_path = checked(args.root_path)
     rig_file = load_rig_file(args.rig, args.devices)
     try:
         service = Service(
@@ -177,7 +182,7 @@ def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access
     names = OWN_NAMES | {name.lower() for name in named}
     if args.no_auth:
         output.note("no tokens are required: everybody on this machine has all scopes")
-        return Access(None, names)
+        return Access(None, names, prefix=args.root_path)
     try:
         own = own_token()
         output.note(f"requests need a token; yours is in {own_file()} (hairstage token show)")
@@ -186,7 +191,7 @@ def _access(args: argparse.Namespace, named: set[str], output: Output) -> Access
         output.note(
             f"no token of yours can be stored here ({error}): make one with 'hairstage token make'"
         )
-    return Access(Tokens(args.root / TOKENS, own), names, Logins(args.root))
+    return Access(Tokens(args.root / TOKENS, own), names, Logins(args.root), prefix=args.root_path)
 
 
 def run_worker(args: argparse.Namespace, output: Output) -> None:
@@ -253,13 +258,11 @@ def add_subject(parser: argparse.ArgumentParser) -> None:
 
 
 def exit_on_sigterm() -> None:
-    """Make SIGTERM end the process as `sys.exit` does: every `finally` runs.
-
-    SIGHUP, a terminal that is closed, counts as SIGTERM unless it is ignored (nohup).
-    """
+    """Make SIGTERM, the usual end of a service, end the process with code 0; SIGHUP too, unless it
+    is ignored."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: sys.exit(0))
 
 
 def log_to_stderr(as_json: bool = False) -> None:

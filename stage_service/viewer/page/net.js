@@ -24,8 +24,9 @@ export async function request(path, options = {}) {
   throw new Error(detail);
 }
 
-export const login = (token) => request("/login", {
-  method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ token }) });
-export const ofModel = (part) => `/view/models/${encodeURIComponent(model)}${part}`;
+export const login = (token) => request("login", {
+  method: "POST", headers: { "content-type": "application/json", "Hairstage-Path": new URL(".", location).pathname },
+  body: JSON.stringify({ token }) });
+export const ofModel = (part) => `view/models/${encodeURIComponent(model)}${part}`;
 export const bytes = async (part, options) => (await request(ofModel(part), options)).arrayBuffer();
 export const json = async (path, options) => (await request(path, options)).json();

@@ -164,9 +164,9 @@ async function begin() {
 }
 
 async function choose() {
-  const names = await net.json("/view/models");
+  const names = await net.json("view/models");
   $("panel").replaceChildren(element("h1", { textContent: "Models" }), ...names.map((name) => element("p", {},
-    element("a", { textContent: name, href: `/view?model=${encodeURIComponent(name)}` }))));
+    element("a", { textContent: name, href: `view?model=${encodeURIComponent(name)}` }))));
   if (!names.length) $("status").textContent = "No models.";
 }
 

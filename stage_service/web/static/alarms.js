@@ -1,7 +1,7 @@
 // Alarms above every view, shown until their cause is removed.
 
 import { attempt } from "./acts.js";
-import { request } from "./api.js";
+import { request, stored } from "./api.js";
 import { dismiss, pressed, right } from "./blackout.js";
 import { button, clock, h, keyed, setContent } from "./dom.js";
 import { contradicts, lampWords } from "./lamps.js";
@@ -85,7 +85,7 @@ function failed(latch) {
   const { id, error } = S.failed;
   const why = latch ? (error ?? "").split("; blackout: ")[0] : error ?? "";
   return alarm("", `Capture ${id} failed.`, `${latch?.detail.includes(why) ? "The reason is above." : why} `, button("dismiss", () => {
-    sessionStorage.setItem("dismissed", id);
+    sessionStorage.setItem(stored("dismissed"), id);
     S.failed = null;
     changed();
   }, { kind: "quiet" }));

@@ -11,12 +11,17 @@ export class Problem extends Error {
   }
 }
 
+/** Where the service is: "/", or a proxy's path prefix. Paths below start with "/" and are resolved against it. */
+export const BASE = new URL(".", location).pathname;
+/** The name of a stored value, because services with other prefixes share the browser's storage. */
+export const stored = (name) => (BASE === "/" ? name : `${name} ${BASE}`);
+
 /** The lease that this page holds: {token, holder}; a reload keeps it. */
 export const own = {
-  get lease() { return JSON.parse(sessionStorage.getItem("lease") ?? "null"); },
+  get lease() { return JSON.parse(sessionStorage.getItem(stored("lease")) ?? "null"); },
   set lease(lease) {
-    if (lease) sessionStorage.setItem("lease", JSON.stringify(lease));
-    else sessionStorage.removeItem("lease");
+    if (lease) sessionStorage.setItem(stored("lease"), JSON.stringify(lease));
+    else sessionStorage.removeItem(stored("lease"));
   },
 };
 
@@ -44,7 +49,7 @@ export async function request(what, body, more = {}) {
   const signals = [AbortSignal.timeout(more.patience ?? PATIENCE_MS)];
   if (more.signal) signals.push(more.signal);
   if (method === "GET") signals.push(yielding[more.yields ? "yield" : "yield all"].signal);
-  const response = await fetch(path, {
+  const response = await fetch(`.${path}`, {
     method,
     headers: { ...(lease ? { "Hairstage-Lease": lease.token } : {}), ...(body === undefined ? {} : { "content-type": "application/json" }), ...more.headers },
     body: body === undefined ? undefined : JSON.stringify(body),

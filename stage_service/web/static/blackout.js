@@ -1,6 +1,6 @@
 // Blackout in every state of the page, repeated until the service responds.
 
-import { emit, request } from "./api.js";
+import { emit, request, stored } from "./api.js";
 import { local } from "./dom.js";
 
 const PATIENCE_MS = 5000; // of the first attempt; a service responds to a blackout within 1 s
@@ -8,8 +8,8 @@ const MOST_PATIENCE_MS = 20_000; // few attempts queue up at a frozen service
 const AGAIN_MS = 500;
 const YIELD_MS = 1200; // a running service responds within this time
 const TEMPORARY = [408, 429]; // and every 5xx; other refusals are final
-const RIGHT = "blackout right";
-const PRESSED = "blackout pressed";
+const RIGHT = stored("blackout right");
+const PRESSED = stored("blackout pressed");
 
 /** The last press on this page: `at` (ms), `going` while the page sends it, `error` of the last failed attempt, `refused`
  * (the service's reason), `response` {at, safe, detail}. Null: not pressed, or dismissed. */

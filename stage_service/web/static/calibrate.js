@@ -1,7 +1,7 @@
 // Calibration: captures of a board and of spheres, detected corners, the calibrated rig.
 
 import { attempt, steering, underLease } from "./acts.js";
-import { captureAt, get, request } from "./api.js";
+import { captureAt, get, request, stored } from "./api.js";
 import { button, clock, h, number, numberIn, setContent, svg, words } from "./dom.js";
 import { pictures } from "./pictures.js";
 import { S, busy, onEvents } from "./state.js";
@@ -15,8 +15,8 @@ const LEAST = 8; // corners of a usable image
 const LONGER = 40; // magnification of drawn residuals
 
 const kept = { boards: [], diffuse: [], mirror: [] };
-const remember = () => Object.assign(kept, JSON.parse(localStorage.getItem("calibration") ?? "{}"));
-const keep = () => localStorage.setItem("calibration", JSON.stringify(kept));
+const remember = () => Object.assign(kept, JSON.parse(localStorage.getItem(stored("calibration")) ?? "{}"));
+const keep = () => localStorage.setItem(stored("calibration"), JSON.stringify(kept));
 let pending = null; // {kind, id}: the capture that this page started, in whichever view
 let onCapture = () => {}; // of the open view
 
@@ -134,7 +134,7 @@ export function open(view) {
         lights && h("p", `${lights.calibrated} of ${S.rig.lights.length} lights were calibrated.`),
         ...result.stages.flatMap((s) => s.warnings.map((w) => h("p.note", w))),
         ...result.stages.flatMap((s) => Object.entries(s.figures.undetermined ?? {}).slice(0, 8).map(([k, why]) => h("p.quiet", `${k}: ${why}`))),
-        result.rig && h(".line", h("a.button", { href: "/calibration/rig.json", download: "rig.json" }, "Accept: download the rig file")),
+        result.rig && h(".line", h("a.button", { href: "./calibration/rig.json", download: "rig.json" }, "Accept: download the rig file")),
         result.rig && h("p.quiet", "Serve with it (hairstage serve --rig rig.json). To repeat: remove bad captures from the lists, shoot others, calibrate again."),
       ]),
     ].filter(Boolean));

@@ -3,6 +3,7 @@
 import { h, setContent } from "./dom.js";
 
 const view = document.getElementById("view");
+const at = location.href.replace(/\/docs.*/, "");
 
 function schemaOf(schema, api) {
   if (!schema) return {};
@@ -30,7 +31,7 @@ function fieldsOf(schema, api) {
 function operation(method, path, op, api) {
   const body = op.requestBody?.content?.["application/json"]?.schema;
   const example = body && schemaOf(body, api).examples?.[0];
-  const line = `curl ${method === "GET" ? "" : `-X ${method} `}${location.origin}${path} -H "Authorization: Bearer $(hairstage token show)"${body ? ` \\\n     -H 'content-type: application/json' -d '${JSON.stringify(example ?? {})}'` : ""}`;
+  const line = `curl ${method === "GET" ? "" : `-X ${method} `}${at}${path} -H "Authorization: Bearer $(hairstage token show)"${body ? ` \\\n     -H 'content-type: application/json' -d '${JSON.stringify(example ?? {})}'` : ""}`;
   const good = Object.entries(op.responses).find(([code]) => code.startsWith("2"));
   const response = good?.[1].content?.["application/json"]?.schema;
   return h("details", { id: op.operationId }, h("summary", h("code", h("b", method), ` ${path}`), h("span.quiet", ` ${op.description?.split(/\.\s/)[0] ?? op.summary ?? ""}`)),
@@ -42,7 +43,7 @@ function operation(method, path, op, api) {
 }
 
 try {
-  const api = await (await fetch("/openapi.json")).json();
+  const api = await (await fetch("./openapi.json")).json();
   const groups = new Map();
   for (const [path, item] of Object.entries(api.paths)) {
     for (const [method, op] of Object.entries(item)) {
@@ -51,7 +52,7 @@ try {
       groups.get(tag).push(operation(method.toUpperCase(), path, op, api));
     }
   }
-  setContent(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route except the open ones needs a token. Problem types are ", h("a", { href: "/docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "/openapi.json" }, "openapi.json"), ". The ", h("a", { href: "/" }, "console"), "."),
+  setContent(view, h("h1", `${api.info.title} ${api.info.version}`), h("p", api.info.summary), h("p.quiet", "Every route except the open ones needs a token. Problem types are ", h("a", { href: "./docs/errors.md" }, "documented"), ". The schema: ", h("a", { href: "./openapi.json" }, "openapi.json"), ". The ", h("a", { href: "./" }, "console"), "."),
     ...[...groups].map(([tag, rows]) => h("section.api", { "aria-label": tag }, h("h2", tag), rows)));
 } catch (error) {
   setContent(view, h("p.bad", `/openapi.json: ${error.message}`));

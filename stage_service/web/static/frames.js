@@ -111,7 +111,7 @@ function captureOf(view, id) {
     if (c.error) rows.Error = h("span.bad", c.error);
     setContent(facts, definitions(rows));
     acts.replaceChildren(
-      h("a.button", { href: `${captureAt(id)}/archive.tar`, download: "" }, "Download"),
+      h("a.button", { href: `.${captureAt(id)}/archive.tar`, download: "" }, "Download"),
       c.job ? h("a.button", { href: `#jobs/${c.job}` }, "Job") : "",
     );
   }

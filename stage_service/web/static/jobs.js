@@ -105,12 +105,12 @@ function jobOf(view, id) {
     const key = `${job.state}/${job.outcome}/${may}`;
     if (acts.dataset.key === key) return;
     acts.dataset.key = key;
-    strands.href = `/view#model=${encodeURIComponent(job.model.split("/").at(-1))}`;
+    strands.href = `./view#model=${encodeURIComponent(job.model.split("/").at(-1))}`;
     acts.replaceChildren(
       ...(job.state !== "done" && may ? [button("Cancel", () => attempt(async () => { await request(`DELETE /jobs/${id}`); load.jobs(); }))] : []),
       ...(job.state === "done" && job.outcome !== "succeeded" && may ? [button("Run it again", () => attempt(again))] : []),
       strands,
-      h("a.button", { href: `/models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
+      h("a.button", { href: `./models/${encodeURIComponent(job.model.split("/").at(-1))}/archive.tar`, download: "" }, "Download the model"),
     );
   }
 
@@ -130,7 +130,7 @@ function jobOf(view, id) {
   }
 
   function filesOf(list) {
-    const link = (path) => `/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
+    const link = (path) => `./jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
     const has = (path) => list.some((f) => f.path === path);
     page.replaceChildren(...(has("index.html") ? [h("h2", "Report"), h("p", h("a", { href: link("index.html"), target: "_blank", rel: "noopener" }, "open the report in a new page"))] : []),
       ...["relit.webp", "relit.png", "comparison.png"].filter(has).map((f) => h("figure", h("img", { src: link(f), alt: f, loading: "lazy" }), h("figcaption", f))));

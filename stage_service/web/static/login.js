@@ -1,6 +1,6 @@
 // The login form. Blackout stays available around it.
 
-import { get, request } from "./api.js";
+import { BASE, get, request } from "./api.js";
 import { keepRight, rightHeader } from "./blackout.js";
 import { h, setContent } from "./dom.js";
 
@@ -12,7 +12,7 @@ export function loginForm(view) {
   view.replaceChildren(h("form.login", { onsubmit: async (event) => {
     event.preventDefault();
     try {
-      keepRight(await request("POST /login", { token: token.value.trim() }, { headers: rightHeader() }));
+      keepRight(await request("POST /login", { token: token.value.trim() }, { headers: { ...rightHeader(), "Hairstage-Path": BASE } }));
       location.reload();
     } catch (error) {
       setContent(wrong, error.message);

@@ -58,7 +58,7 @@ export function pictures(grid, signal) {
       image.onload = done;
       image.onerror = () => { setContent(text, `${name}: no frame`); done(); };
       image.alt = `${name}, ${more.words}`;
-      image.src = `${next.path}.png?${[`size=${Math.min(Math.max(width, height), 480)}`, ...more.query].join("&")}`;
+      image.src = `.${next.path}.png?${[`size=${Math.min(Math.max(width, height), 480)}`, ...more.query].join("&")}`;
       setContent(text, name);
       drawn.replaceChildren(...(more.over?.(name) ?? []));
       if (more.figures) showFigures(next);

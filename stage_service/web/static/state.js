@@ -1,6 +1,6 @@
 // The state of the service: requested at the start, updated by events.
 
-import { captureAt, get, own, request, service } from "./api.js";
+import { captureAt, get, own, request, service, stored } from "./api.js";
 import { keepRight, pressed } from "./blackout.js";
 import { clock, local } from "./dom.js";
 import { follow } from "./stream.js";
@@ -73,7 +73,7 @@ export function silence() {
 
 /** Timeout of the light bank's watchdog, as this browser last read it; null: no watchdog; undefined: never read. */
 function watchdogSeconds() {
-  const kept = localStorage.getItem("watchdog_s");
+  const kept = localStorage.getItem(stored("watchdog_s"));
   return S.rig?.watchdog_s !== undefined ? S.rig.watchdog_s : kept === null ? undefined : JSON.parse(kept);
 }
 
@@ -128,7 +128,7 @@ const SNAPSHOT = "snapshot"; // listed as a capture only while it is exposed
 export const load = {
   rig: () => fresh("rig", "/rig", (x) => {
     S.rig = x;
-    localStorage.setItem("watchdog_s", JSON.stringify(x.watchdog_s ?? null));
+    localStorage.setItem(stored("watchdog_s"), JSON.stringify(x.watchdog_s ?? null));
   }),
   health: () => fresh("health", "/health", (x) => {
     const latch = x.latch && { ...x.latch, detail: local(x.latch.detail) };
@@ -235,7 +235,7 @@ async function all(mine) {
   await Promise.all([load.rig(), load.lease(), load.queue(), load.now(), load.jobs()]);
   if (version && S.health.version !== version) location.reload(); // the service was updated: load its console
   if (S.capture?.state === "done" && S.capture.outcome === "failed" && S.failed === null
-      && sessionStorage.getItem("dismissed") !== S.capture.id) S.failed = { id: S.capture.id, error: S.capture.error };
+      && sessionStorage.getItem(stored("dismissed")) !== S.capture.id) S.failed = { id: S.capture.id, error: S.capture.error };
   await keepLease();
   if (mine !== line) return;
   S.connected = true;

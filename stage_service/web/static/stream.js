@@ -24,7 +24,7 @@ export function follow(on) {
       emit("contact");
     };
     try {
-      const response = await fetch("/events", { signal: abort.signal, cache: "no-store", credentials: "same-origin" });
+      const response = await fetch("./events", { signal: abort.signal, cache: "no-store", credentials: "same-origin" });
       if (response.status === 401) {
         emit("logged out");
         return { over: true };

@@ -179,7 +179,7 @@ def test_a_damaged_file_of_tokens_opens_nothing(call, tokens, tmp_path):
 def test_an_empty_file_of_one_s_own_token_opens_nothing(service, tmp_path, monkeypatch, capsys):
     (tmp_path / "token").write_text("\n")
     monkeypatch.setenv("HAIRSTAGE_TOKEN_FILE", str(tmp_path / "token"))
-    args = argparse.Namespace(no_auth=False, root=tmp_path / "root")
+    args = argparse.Namespace(no_auth=False, root=tmp_path / "root", root_path="")
     app = create_app(service, processes._access(args, set(), Output(as_json=False)))
     refused(send(app, "GET /audit", {"Authorization": "Bearer "}), "unauthorized", 401)
     assert "is empty: remove it" in capsys.readouterr().err
@@ -192,7 +192,9 @@ def test_requests_of_another_site_are_refused(service, origin):
     app = create_app(service)
     headers = {"Origin": origin, "Content-Type": "text/plain"}
     for what in ("/captures/x/resume", "/devices/blackout", "/captures"):
-        refused(send(app, f"POST {what}", headers), "foreign-origin", 403)
+        detail = refused(send(app, f"POST {what}", headers), "foreign-origin", 403)["detail"]
+        assert "Host is '127.0.0.1'" in detail
+        assert "proxy_set_header Host $http_host;" in detail
     assert send(app, "POST /devices/blackout", {"Origin": URL}).status_code == 200
     for host in ("evil.example", "127.0.0.1.evil.example", ""):
         refused(send(app, "GET /lease", {"Host": host}), "http", 421)

@@ -47,7 +47,7 @@ def started(
     """`with started() as ask`: a service of the root folder, as `hairstage serve` starts it."""
     (tmp_path / "token").write_text("mine")
     monkeypatch.setenv("HAIRSTAGE_TOKEN_FILE", str(tmp_path / "token"))
-    args = argparse.Namespace(no_auth=False, root=tmp_path / "root")
+    args = argparse.Namespace(no_auth=False, root=tmp_path / "root", root_path="")
 
     @contextmanager
     def start() -> Iterator[Call]:

@@ -1,5 +1,8 @@
 """Logging in from a browser: the one test of pages that is not slow."""
 
+from urllib.parse import urlsplit
+
+import pytest
 from browsing import Pages, says
 from serving import serving
 
@@ -8,11 +11,15 @@ from stage_service.records.attempts import FREE
 from stage_service.records.tokens import Tokens
 
 
-def test_a_page_without_a_login_shows_the_login_form(simulated, browser, tmp_path):
-    access = Access(Tokens(tmp_path / "none", "the key"))
+@pytest.mark.parametrize("prefix", ["", "/stage"])
+def test_a_page_without_a_login_shows_the_login_form(simulated, browser, tmp_path, prefix):
+    """Under a path prefix every request of the page has it."""
+    access, paths = Access(Tokens(tmp_path / "none", "the key"), prefix=prefix), []
     with serving(simulated()[0], tmp_path / "root", access, all_read=False) as http:
-        pages = Pages(browser, str(http.base_url).rstrip("/"))
-        page = pages.open()
+        pages = Pages(browser, str(http.base_url).rstrip("/") + prefix)
+        page = pages.open(
+            prepare=lambda page: page.on("request", lambda r: paths.append(urlsplit(r.url).path))
+        )
         page.wait_for_selector("[name=token]:focus")
         page.keyboard.type("another")
         page.keyboard.press("Enter")
@@ -31,4 +38,8 @@ def test_a_page_without_a_login_shows_the_login_form(simulated, browser, tmp_pat
         page.fill("[name=token]", "the key")
         page.keyboard.press("Enter")
         says(page, "Dark, verified")
+        page.keyboard.press("F9")
+        page.wait_for_selector("text=dark, verified, after")
         pages.close()
+    assert f"{prefix}/devices/blackout" in paths
+    assert all(path.startswith(f"{prefix}/") for path in paths), paths
