@@ -10,6 +10,7 @@ import hashlib
 import re
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -95,13 +96,15 @@ class PjLinkProjector:
     def _request(self, command: str, pattern: str, shown: str, doing: str) -> str:
         """Send `command` and return what follows `=` in its reply: a match of `pattern`, which
         errors describe as `shown`."""
-        deadline = time.monotonic() + self.timeout_s
+        deadline, line, sent = time.monotonic() + self.timeout_s, "", ""
         try:
             with socket.create_connection((self.host, self.port), self.timeout_s) as link:
-                digest = self._digest(_line(link, deadline), doing)
+                lines = _lines(link, deadline)
+                sent = f"{self._digest(next(lines), doing)}%1{command}"
                 link.settimeout(_left(deadline))
-                link.sendall(f"{digest}%1{command}\r".encode("ascii"))
-                line = _line(link, deadline)
+                link.sendall(f"{sent}\r".encode("ascii"))
+                while line in ("", sent):  # an echo
+                    line = next(lines)
         except _Incomplete as cut:
             received = f"{cut}, and the connection was closed"
             todo = "The projector takes few connections at once: check what else uses it."
@@ -109,7 +112,8 @@ class PjLinkProjector:
             raise self._error(DeviceUnreachable, doing, expected, received, todo) from cut
         except TimeoutError as error:
             todo = "Check the projector's network standby setting, cable and address."
-            raise self._error(DeviceTimeout, doing, "a reply", str(error), todo) from error
+            received = "only an echo of the command" if line else str(error)
+            raise self._error(DeviceTimeout, doing, "a reply", received, todo) from error
         except OSError as error:
             todo = "Check address, network and that PJLink is enabled in the projector."
             raise self._error(DeviceUnreachable, doing, "a connection", str(error), todo) from error
@@ -173,19 +177,22 @@ def _left(deadline: float) -> float:
     return left
 
 
-def _line(link: socket.socket, deadline: float) -> str:
-    """The next line; bytes outside ASCII are escaped for the error message."""
+def _lines(link: socket.socket, deadline: float) -> Iterator[str]:
+    """Lines without a line feed before them; bytes outside ASCII are escaped for the error
+    message."""
     data = b""
-    while b"\r" not in data and len(data) < _LONGEST_LINE:
-        try:
-            link.settimeout(_left(deadline))
-            got = link.recv(_LONGEST_LINE)
-        except TimeoutError:
-            raise TimeoutError(_shown(data)) from None
-        if not got:
-            raise _Incomplete(_shown(data))
-        data += got
-    return data.split(b"\r", 1)[0].decode("ascii", "backslashreplace")
+    while True:
+        while b"\r" not in data and len(data) < _LONGEST_LINE:
+            try:
+                link.settimeout(_left(deadline))
+                got = link.recv(_LONGEST_LINE)
+            except TimeoutError:
+                raise TimeoutError(_shown(data)) from None
+            if not got:
+                raise _Incomplete(_shown(data))
+            data += got
+        line, _, data = data.partition(b"\r")
+        yield line.decode("ascii", "backslashreplace").removeprefix("\n")
 
 
 def _shown(data: bytes) -> str:

@@ -94,6 +94,29 @@ def test_power_goes_through_warm_up_to_on_and_through_cooling_to_standby(
     assert projector.power() is Power.STANDBY
 
 
+@pytest.mark.parametrize("before", [b"\n", b"\n%1POWR ?\r", b"%1POWR ?\r\n\r\n"])
+def test_echo_and_line_feeds_are_dropped_and_alone_are_no_reply(slack: int, before: bytes) -> None:
+    for reply in (b"%1POWR=1\r\n", b""):
+        held = threading.Event()
+
+        def reply_with(link: socket.socket, reply=reply, held=held) -> None:
+            link.sendall(b"PJLINK 0\r")
+            assert link.recv(100) == b"%1POWR ?\r"
+            for byte in before + reply:
+                link.sendall(bytes((byte,)))
+            held.wait(60)
+
+        port, thread = peer(reply_with)
+        projector = PjLinkProjector("front", "127.0.0.1", port, timeout_s=0.4 * slack)
+        if reply:
+            assert projector.power() is Power.ON
+        else:
+            with pytest.raises(DeviceTimeout, match=r"received (only an echo|'\\n'|nothing)"):
+                projector.power()
+        held.set()
+        thread.join()
+
+
 def test_a_projector_without_a_password_does_not_mind_one(rig: Rig) -> None:
     assert rig.projector("", PASSWORD).power() is Power.STANDBY
 
