@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from stage_service.cli.support.children import end
 from stage_service.cli.support.commands import FAILED, CommandError, Commands, Output
 from stage_service.signals import tied
 
@@ -65,4 +66,9 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
         [str(tests.parent), str(tests), *filter(None, [os.environ.get("PYTHONPATH")])]
     )
     command = [sys.executable, "-m", "benchmarks", args.name, *args.arguments]
-    return subprocess.run(tied(command), env={**os.environ, "PYTHONPATH": path}).returncode
+    environment = {**os.environ, "PYTHONPATH": path}
+    child = subprocess.Popen(tied(command), env=environment, text=True, start_new_session=True)
+    try:
+        return child.wait()
+    finally:
+        end(child)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.demo_kinds import FULL, QUICK, DemoKind, quick_rig
-from stage_service.cli.stage.processes import SUBJECTS, add_subject, exit_on_sigterm
+from stage_service.cli.stage.processes import SUBJECTS, add_subject
 from stage_service.cli.support.commands import (
     FAILED,
     BadArgument,
@@ -46,7 +46,8 @@ READY_S = 300.0
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    demo = add_command(commands, "demo", run_demo)
+    remains = "lamps and processes are off; the next demo in the same folder begins anew"
+    demo = add_command(commands, "demo", run_demo, interrupted=remains)
     add_subject(demo)
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="output folder")
     demo.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")
@@ -68,7 +69,6 @@ def run_demo(args: argparse.Namespace, output: Output) -> None:
     from stage_service.cli.support.children import Children
     from stage_service.cli.support.client import ServiceClient
 
-    exit_on_sigterm()
     begin = time.perf_counter()
     out: Path = args.out
     os.environ.setdefault("HAIRSTAGE_TOKEN_FILE", str((out / "token").resolve()))

@@ -24,7 +24,8 @@ def add(commands: Commands) -> None:
     verify = add_command(commands, "verify", run_verify)
     verify.add_argument("capture", type=Path, help="the capture folder")
 
-    imported = add_command(commands, "import", run_import)
+    remains = "the unfinished capture was removed; the same command begins anew"
+    imported = add_command(commands, "import", run_import, interrupted=remains)
     imported.add_argument("folder", type=Path)
     imported.add_argument("--out", type=Path, required=True, help="new capture folder")
     imported.add_argument(

@@ -10,7 +10,6 @@ from importlib import import_module
 from benchmarks.command import Benchmark, LeftOut
 from benchmarks.publish import check_tree, publish
 from stage_service.cli.bench import BENCHMARKS
-from stage_service.cli.stage.processes import exit_on_sigterm
 from stage_service.cli.support.commands import (
     FAILED,
     CommandError,
@@ -88,5 +87,4 @@ def run_bench(args: argparse.Namespace, output: Output) -> int:
 
 
 if __name__ == "__main__":
-    exit_on_sigterm()
     sys.exit(main())

@@ -22,7 +22,8 @@ FIELDS = ("none", "modulation", "additive")
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    fit = add_command(commands, "fit", run)
+    remains = "the same command resumes inverse_rendering and fields, and begins a sun fit anew"
+    fit = add_command(commands, "fit", run, interrupted=remains)
     fit.add_argument("capture", type=Path)
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
     fit.add_argument("--method", choices=METHODS, default="sun")

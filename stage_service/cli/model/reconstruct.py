@@ -29,7 +29,8 @@ MEMORY_SHARE = 0.8  # of this machine's memory; above it, a larger --reduce is s
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    reconstruct = add_command(commands, "reconstruct", run)
+    remains = "the same command begins anew"
+    reconstruct = add_command(commands, "reconstruct", run, interrupted=remains)
     reconstruct.add_argument("capture", type=Path)
     reconstruct.add_argument("--method", choices=METHODS, default="auto")
     reconstruct.add_argument("--out", type=Path, help="model folder")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from stage_service.cli.support.commands import (
     rig_path,
 )
 from stage_service.cli.support.remote import add_remote
+from stage_service.signals import Terminated, held
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -128,13 +130,23 @@ def run_start(args: argparse.Namespace, output: Output, service: ServiceClient) 
     body = requested(args)
     if args.armed_by is not None:
         body["armed_by"] = args.armed_by
+    capture: dict[str, Any] = {}
     if not args.wait:
         capture = service.post("/captures", body)
         output.result(capture, f"capture {capture['id']} runs")
         return 0
     with service.leased() as renew, progress_bar("capture") as progress:
-        capture = service.post("/captures", body)
-        capture = service.follow_capture(capture["id"], progress, renew)
+        try:
+            with held(signal.SIGINT, signal.SIGTERM):  # until its id is known
+                capture = service.post("/captures", body)
+            capture = service.follow_capture(capture["id"], progress, renew)
+        except (KeyboardInterrupt, Terminated) as stop:
+            if not capture:
+                raise
+            service.post(f"/captures/{capture['id']}/abort")
+            capture = service.follow_capture(capture["id"], progress)
+            remains = f"capture {capture['id']} {capture['outcome']}; 'hairstage capture resume "
+            raise type(stop)(f"{remains}{capture['id']}' shoots the rest") from None
     if capture["outcome"] != "completed":
         output.result({"capture": capture}, f"{capture['outcome']}: {capture['error'] or ''}")
         return FAILED

@@ -15,6 +15,7 @@ from stage_service.cli.support.commands import (
     read_json,
 )
 from stage_service.cli.support.remote import add_remote
+from stage_service.signals import Terminated
 
 if TYPE_CHECKING:
     from stage_service.cli.support.client import ServiceClient
@@ -86,8 +87,12 @@ def run_job_action(args: argparse.Namespace, output: Output, service: ServiceCli
 
 def wait_for_job(service: ServiceClient, job: str, output: Output, more: dict[str, Any]) -> int:
     """Follow a job to its end and print it together with `more`; returns the exit code."""
-    with progress_bar("job") as progress:
-        done = service.follow_job(job, progress)
+    try:
+        with progress_bar("job") as progress:
+            done = service.follow_job(job, progress)
+    except (KeyboardInterrupt, Terminated) as stop:
+        remains = f"job {job} continues: 'hairstage jobs wait' or 'cancel {job}'"
+        raise type(stop)(remains) from None
     why = f": {done['error']['detail']}" if done["error"] else ""
     output.result({**more, "job": done}, f"{job} {done['outcome']}{why}; model: {done['model']}")
     return 0 if done["outcome"] == "succeeded" else FAILED

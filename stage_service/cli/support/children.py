@@ -36,12 +36,13 @@ class Children:
 
     def __exit__(self, *_: object) -> None:
         # a second Ctrl-C must not leave lamps on
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             for _name, child in reversed(self._running):
                 end(child)
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def start(
         self, name: str, command: list[str], *, to_log: bool = True, pipe: bool = False

@@ -9,16 +9,20 @@ import inspect
 import json
 import math
 import os
+import platform
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from reconstruction import Progress
 from reconstruction.reading import parse_json
+from stage_service.signals import Terminated, terminable
 
 EXIT_CODES = {
     0: "done",
@@ -26,7 +30,8 @@ EXIT_CODES = {
     2: "wrong usage",
     3: "bad input: a file, folder, rig, plan or name that cannot be used",
     4: "the service, the simulators or a device cannot be reached",
-    130: "interrupted",
+    130: "interrupted by Ctrl-C",
+    143: "terminated by SIGTERM",
 }
 FAILED, BAD_INPUT, UNREACHABLE = 1, 3, 4
 PRIVATE = 0o027
@@ -138,11 +143,16 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def add_command(
-    commands: Commands, name: str, run: Callable[..., int | None], help: str | None = None
+    commands: Commands,
+    name: str,
+    run: Callable[..., int | None],
+    help: str | None = None,
+    interrupted: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a command with `--json`, its help, and `run`, the function that runs it.
+    """Add a command with `--json` and `--debug`, its help, and `run`, the function that runs it.
 
     The help is the docstring of `run`: its first sentence, and the rest as the description.
+    `interrupted` says what remains of an interrupted run, and what the next one does.
     """
     first, _, rest = (inspect.getdoc(run) or "").partition("\n\n")
     help = help or _phrase(first)
@@ -150,7 +160,8 @@ def add_command(
         name, help=help, description=rest or _sentence(help), formatter_class=_Help
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-    parser.set_defaults(run=run)
+    parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
+    parser.set_defaults(run=run, interrupted=interrupted)
     return parser
 
 
@@ -228,27 +239,50 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
     """Run the command that `argv` names; returns its exit code (see `EXIT_CODES`)."""
     args = parser.parse_args(argv)
     output = Output(as_json=args.json)
+    debug = getattr(args, "debug", False)
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # OpenEXR prints warnings
+        with terminable(), contextlib.redirect_stdout(sys.stderr):  # OpenEXR prints warnings
             return args.run(args, output) or 0
-    except KeyboardInterrupt:
-        output.error("Interrupted", "interrupted")
-        return 130
+    except (KeyboardInterrupt, Terminated) as stop:
+        what, code = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
+        remains = str(stop) or getattr(args, "interrupted", "")
+        output.error("Interrupted", f"{what}: {remains}" if remains else what)
+        return code
     except BrokenPipeError:
         # the reader has closed the pipe; the interpreter flushes once more at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except CommandError as error:
-        output.error(error.kind, str(error), **error.more)
-        return error.code
     except Exception as error:
-        if isinstance(error, OSError | ValueError | LookupError) and _is_ours(error):
-            output.error(type(error).__name__, _message(error))
-            return BAD_INPUT
-        if type(error).__name__ != "BackendError":  # by name: its module may fail to import
+        kind, code = type(error).__name__, FAILED
+        if isinstance(error, CommandError):
+            output.error(error.kind, str(error), **error.more)
+            code = error.code
+        elif isinstance(error, OSError | ValueError | LookupError) and _is_ours(error):
+            output.error(kind, _message(error))
+            code = BAD_INPUT
+        elif kind == "BackendError":  # by name: its module may fail to import
+            output.error(kind, str(error))
+        else:
+            where = "the traceback below" if debug else _stored_trace()
+            output.error(kind, f"a fault of hairstage, report it with {where}: {kind}: {error}")
+        if debug:
             traceback.print_exc(file=sys.stderr)
-        output.error(type(error).__name__, str(error))
-        return FAILED
+        return code
+
+
+def _stored_trace() -> str:
+    """The file with versions and the traceback of the present exception; without a disk the text
+    itself."""
+    about = f"hairstage {version('hairstage')}, Python {sys.version}, {platform.platform()}"
+    text = f"{about}\n\n{traceback.format_exc()}"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="hairstage-error-", suffix=".txt", delete=False
+        ) as file:
+            file.write(text)
+    except OSError:
+        return f"this text:\n{text}"
+    return file.name
 
 
 def _is_ours(error: Exception) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import OpenImageIO as oiio
 import pytest
 from dng_writer import BLACK, BLUE, GREEN, RED, WHITE, write_dng
 
-from reconstruction import Capture, import_folder, verify, write_exr
+from reconstruction import Capture, CaptureWriter, import_folder, verify, write_exr
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
@@ -411,6 +412,31 @@ def test_options_without_effect_are_refused(folder, tmp_path, capsys, requested,
     assert main(["import", str(folder), "--out", str(tmp_path / "out"), *requested]) != 0
     assert says in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_import_that_is_stopped_leaves_nothing(
+    folder, tmp_path, monkeypatch, capsys, number, code
+):
+    everywhere(lambda c, n, x: save(folder / "images" / c / f"{n}.png", x, np.uint16))
+    command = ["import", str(folder), "--out", str(tmp_path / "out")]
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}[number]
+    write, before = CaptureWriter.write_frame, signal.signal(number, usual)
+    with monkeypatch.context() as stopped:
+        written = []
+
+        def second_stops(*args, **more):
+            write(*args, **more)
+            written.append(args)
+            if len(written) == 2:
+                signal.raise_signal(number)
+
+        stopped.setattr(CaptureWriter, "write_frame", second_stops)
+        assert main(command) == code
+    assert "the unfinished capture was removed" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert signal.signal(number, before) is usual
+    assert main(command) == 0
 
 
 def test_a_dry_run_draws_beside_a_folder_that_is_not_there(folder, tmp_path, monkeypatch, capsys):

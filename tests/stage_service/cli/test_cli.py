@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until
 
 from reconstruction import (
     Camera,
@@ -100,6 +101,32 @@ def test_output_of_libraries_is_no_part_of_a_result(capsys):
     shown = capsys.readouterr()
     assert json.loads(shown.out) == {"found": 1}
     assert "Warning" in shown.err
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_a_fault_is_one_sentence_with_its_traceback_in_a_file(capsys, tmp_path, monkeypatch, debug):
+    def faulty(args, output):
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    parser = argparse.ArgumentParser()
+    parser.set_defaults(run=faulty, json=False, debug=debug)
+    assert run_command(parser, []) == 1
+    first, *rest = capsys.readouterr().err.splitlines()
+    assert first.startswith("hairstage: a fault of hairstage, report it with ")
+    assert first.endswith("ZeroDivisionError: division by zero")
+    files = list(tmp_path.iterdir())
+    traceback = rest if debug else files[0].read_text().splitlines()
+    assert "Traceback (most recent call last):" in traceback
+    assert bool(rest) == debug == (not files)
+
+
+def test_bad_input_has_a_traceback_only_with_debug(capsys, tmp_path):
+    for debug in (False, True):
+        assert main(["verify", str(tmp_path / "none"), *(["--debug"] if debug else [])]) == 3
+        first, *rest = capsys.readouterr().err.splitlines()
+        assert "no such folder" in first
+        assert ("Traceback (most recent call last):" in rest) == bool(rest) == debug
 
 
 def test_wrong_usage_is_exit_code_2(capsys):
@@ -503,6 +530,21 @@ def test_a_service_from_the_command_line(capsys, rig_file, world, tmp_path):
             plan.write_text('{"lights": ["lamp"]}')
             code, data = run(capsys, "capture", "start", "--plan", plan, "--url", url)
             assert (code, data["error"]["problem"]["type"]) == (3, "/docs/errors.md#invalid-plan")
+            # A command that waits and is stopped in mid-capture: dark, aborted, its id.
+            plan.write_text('{"rate_hz": 8, "projectors": [], "stepping": "software"}')
+            for number, ends in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+                words = ["capture", "start", "--wait", "--json", "--url", url, "--plan", str(plan)]
+                waits = [sys.executable, "-m", "stage_service.cli", *words]
+                with subprocess.Popen(waits, stdout=subprocess.PIPE, text=True) as waiting:
+                    until(lambda: world.lit)
+                    waiting.send_signal(number)
+                    out, _ = waiting.communicate(timeout=60)
+                assert (waiting.returncode, world.lit) == (ends, set())
+                code, data = run(capsys, "capture", "list", "--url", url)
+                newest = data["captures"][-1]
+                assert newest["outcome"] == "aborted"
+                assert f"resume {newest['id']}' shoots" in json.loads(out)["error"]["detail"]
+                assert run(capsys, "lease", "show", "--url", url)[1]["holder"] is None
             # SIGTERM in mid-capture: dark, a manifest that says so, exit code 0.
             world.busy["cam_0"] = 10**9
             code, data = run(capsys, "capture", "start", "--url", url)
