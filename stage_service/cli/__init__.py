@@ -8,13 +8,13 @@ import argparse
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from stage_service.cli import bench, calibrate, demo, head, rig, verify
+from stage_service.cli import bench, calibrate, demo, doctor, head, rig, verify
 from stage_service.cli.model import edit, evaluate, export, fit, page, reconstruct, render, view
 from stage_service.cli.stage import capture, jobs, lease, processes, queue, stage, store, tokens
 from stage_service.cli.support.commands import EXIT_CODES, run_command
 
 COMMANDS = (
-    *(demo, processes, stage, capture, queue, lease, jobs, store, tokens),
+    *(demo, doctor, processes, stage, capture, queue, lease, jobs, store, tokens),
     *(verify, reconstruct, fit, render, view, edit, export, page),
     *(evaluate, bench, rig, calibrate, head),
 )
