@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import re
@@ -25,13 +26,29 @@ def read_json(path: str | Path) -> Any:
         raise ValueError(f"{path}: {error}") from error
 
 
+def read_text(path: str | Path, otherwise: str | None = None) -> str:
+    """The text of a file in UTF-8, or in UTF-16 by its byte order mark, else in `otherwise`.
+
+    A byte order mark and a DOS end of file are left out. Raises `OSError`, and `ValueError` naming
+    the file if it is not text.
+    """
+    data = plain_file(path).read_bytes().rstrip(b"\x1a")
+    encoding = "utf-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        if otherwise is not None:
+            return data.decode(otherwise)
+        raise ValueError(f"{path}: not text in UTF-8 ({error})") from error
+
+
 def parse_json(data: bytes | str) -> Any:
     """A JSON text in UTF-8 as RFC 7493 (I-JSON) restricts it.
 
     Raises `ValueError` for NaN, Infinity and numbers beyond float64, lone surrogates and NUL,
     duplicate names, and more than `DEEPEST` levels.
     """
-    text = data.decode() if isinstance(data, bytes) else data
+    text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
     try:
         value = json.loads(
             text, parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_distinct

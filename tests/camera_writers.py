@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from reconstruction import Camera
+
+LENS = np.array([-0.12, 0.03, 2e-3, -1e-3, 0.01])
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
@@ -199,3 +202,82 @@ def write_calib(path: Path, cameras: Sequence[Camera]) -> None:
             lines.append(f"\t\t{name} " + " ".join(repr(float(v)) for v in value))
         lines.append("#    extrinsics")
     path.write_text("\n".join(lines) + "\n")
+
+
+def write_rig(path: Path, cameras: list[Camera], change: Callable[[str], str] = str) -> None:
+    """Metashape's XML of a rig: the first camera the master, the others by their sensors' offsets
+    to it; a component turned by 90 degrees about z, scaled by 2 and moved."""
+
+    def text(values: np.ndarray) -> str:
+        return " ".join(repr(float(v)) for v in values.ravel())
+
+    def pose(camera: Camera) -> np.ndarray:
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = camera.R.T, camera.center
+        return out
+
+    turn, move = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([0.3, 0.2, 0.1])
+    inner = [np.eye(4) for _ in cameras]
+    for matrix, camera in zip(inner, cameras, strict=True):  # world to component
+        matrix[:3, :3] = turn.T @ camera.R.T
+        matrix[:3, 3] = turn.T @ (camera.center - move) / 2
+    sensors = entries = ""
+    for i, camera in enumerate(cameras):
+        offset = np.linalg.inv(inner[0]) @ inner[i]
+        rig = (
+            f"<rotation>{text(offset[:3, :3])}</rotation><location>{text(offset[:3, 3])}</location>"
+        )
+        K, (k1, k2, p1, p2, k3) = camera.K, camera.distortion
+        of_master = ' master_id="0"' if i else ""
+        sensors += f"""<sensor id="{i}"{of_master} type="frame"><calibration type="frame">
+<resolution width="{camera.width}" height="{camera.height}"/><f>{float(K[1, 1])!r}</f>
+<b1>{float(K[0, 0] - K[1, 1])!r}</b1><cx>{float(K[0, 2] + 0.5 - camera.width / 2)!r}</cx>
+<cy>{float(K[1, 2] + 0.5 - camera.height / 2)!r}</cy><k1>{k1}</k1><k2>{k2}</k2><k3>{k3}</k3>
+<p1>{p2}</p1><p2>{p1}</p2></calibration>{rig if i else ""}</sensor>"""
+        place = "" if i else f"<transform>{text(inner[0])}</transform>"
+        entries += f"""<camera id="{i}" sensor_id="{i}" component_id="0"{of_master}
+ label="{camera.name}">{place}</camera>"""
+    path.write_text(
+        change(f"""<document><chunk><sensors>{sensors}</sensors><components active_id="0">
+<component id="0"><transform>
+<rotation>{text(turn)}</rotation><translation>{text(move)}</translation>
+<scale>2</scale></transform></component></components><cameras>{entries}</cameras>
+<reference>LOCAL_CS["Local",UNIT["metre",1]]</reference></chunk></document>""")
+    )
+
+
+def write_easymocap(folder: Path, cameras: list[Camera], *, vectors=True, sizes=True) -> None:
+    """By EasyMocap's own text: six digits, CRLF (camera_utils.FileStorage)."""
+    folder.mkdir()
+    files = {"intri.yml": "", "extri.yml": ""}
+
+    def put(file: str, key: str, value: np.ndarray) -> None:
+        data = ", ".join(f"{v:.6f}" for v in value.ravel())
+        files[file] += f"{key}: !!opencv-matrix\r\n  rows: {len(value)}\r\n"
+        files[file] += f"  cols: {value.shape[1]}\r\n  dt: d\r\n  data: [{data}]\r\n"
+
+    for i, camera in enumerate(cameras):
+        name = f"{i + 1:02d}"
+        put("intri.yml", f"K_{name}", camera.K)
+        put("intri.yml", f"{'dist' if i % 2 else 'D'}_{name}", camera.distortion[None])
+        if sizes:
+            files["intri.yml"] += f"H_{name}: {camera.height}\r\nW_{name}: {camera.width}\r\n"
+        if vectors:
+            put("extri.yml", f"R_{name}", cv2.Rodrigues(camera.R)[0])
+        put("extri.yml", f"Rot_{name}", camera.R)
+        put("extri.yml", f"T_{name}", camera.t[:, None])
+    names = "".join(f'  - "{i + 1:02d}"\r\n' for i in range(len(cameras)))
+    for file, text in files.items():
+        (folder / file).write_text(f"%YAML:1.0\r\n---\r\nnames:\r\n{names}{text}", newline="")
+
+
+def stage() -> list[Camera]:
+    """Six cameras about the origin, tilted, one upright, half of them through a lens."""
+    out = []
+    for i in range(6):
+        angle = 1.1 * i
+        position = [np.cos(angle), np.sin(angle), 0.3 * np.sin(2 * angle)]
+        camera = Camera.look_at(f"cam_{i:02d}", 640, 480, position, [0, 0, 0.01], 30, 17.0 * i)
+        K = camera.K * [[1, 1, 1], [1, 1.01, 1], [1, 1, 1]] + [[0, 0, 4.2], [0, 0, -7.3], [0, 0, 0]]
+        out.append(replace(camera, K=K, distortion=LENS * (i % 2)))
+    return out

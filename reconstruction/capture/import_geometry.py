@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from reconstruction.files.cameras import read_cameras
-from reconstruction.files.lights import from_directions, read_lights
+from reconstruction.files.lights import LightFile, from_directions, read_lights
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.placement import (
@@ -18,8 +18,10 @@ from reconstruction.geometry.placement import (
     PlacementError,
     PlacementOptions,
     Sight,
+    Unit,
     check_cameras,
     check_lights,
+    metres,
     placed,
     placed_lights,
 )
@@ -89,6 +91,11 @@ def read_geometry(files: GeometryFiles) -> Geometry:
         )
     if files.cameras is not None:
         read = read_cameras(files.cameras)
+        if read.metres is not None and metres(files.placement.unit) != read.metres:
+            if files.placement.unit == "m":
+                files = replace(files, placement=replace(files.placement, unit=read.metres))
+            else:
+                notes.append(_two_units(files.cameras, read.metres, "--unit", files.placement.unit))
         cameras = placed(read.cameras, files.placement, read.axes)
         notes += read.notes
         if read.unitless:
@@ -102,15 +109,25 @@ def read_geometry(files: GeometryFiles) -> Geometry:
     lights: list[Light] = []
     if files.lights is not None:
         found = read_lights(files.lights)
-        lights, more = _lights(files, found.directions, found.lights, cameras)
+        lights, more = _lights(files, found, cameras)
         notes += found.notes + more
     return Geometry({c.name: c for c in cameras}, lights, notes)
 
 
+def _two_units(path: Path | None, stated: float, option: str, given: Unit) -> str:
+    return f"{path}: states a unit of {stated:g} m, {option} is {metres(given):g} m, which is used"
+
+
 def _lights(
-    files: GeometryFiles, directions: bool, lights: list[Light], cameras: list[Camera]
+    files: GeometryFiles, found: LightFile, cameras: list[Camera]
 ) -> tuple[list[Light], list[str]]:
-    where = files.placement
+    where, lights, directions = files.placement, found.lights, found.directions
+    notes: list[str] = []
+    if found.metres is not None:
+        given = where.light_unit
+        if given is not None and metres(given) != found.metres:
+            notes.append(_two_units(files.lights, found.metres, "--light-unit", given))
+        where = replace(where, light_unit=found.metres if given is None else given)
     names = [c.name for c in cameras]
     for light in lights:
         if light.beside is not None and light.beside not in names:
@@ -132,8 +149,9 @@ def _lights(
     except PlacementError as error:
         raise PlacementError(f"{files.lights}: {error}") from error
     if not directions:
-        return out, []
+        return out, notes
     return out, [
+        *notes,
         f"{files.lights}: all lights are at distance 1 from the origin and are read as positions; "
-        "if they are directions, give --light-distance"
+        "if they are directions, give --light-distance",
     ]

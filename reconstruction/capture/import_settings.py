@@ -37,11 +37,11 @@ class ImportProblem(CaptureError):
 class Patterns:
     """File name patterns of each kind of image, relative to the folder.
 
-    `{camera}`, `{light}` and `{projector}` are names, or the number at the end of a name;
-    `{exposure}` is seconds (`0.02`, `1-50`) or a key of `exposures`; `{row}` a projector's row;
-    `{number}` the order of capture, one count for tracking frames and rows (lights captured once
-    may be counted per camera); `*` is any text. `clean_plate` shows the stage without the subject,
-    `flat` an evenly lit field.
+    `{camera}`, `{light}` and `{projector}` are names, or the number at the end of a name with any
+    zeros before it (7, 07, light_07); `{exposure}` is seconds (`0.02`, `1-50`) or a key of
+    `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for tracking
+    frames and rows (lights captured once may be counted per camera); `*` is any text.
+    `clean_plate` shows the stage without the subject, `flat` an evenly lit field.
     """
 
     olat: str = "images/{camera}/{light}.*"
@@ -293,9 +293,9 @@ class _Names:
     def _expression(self, pattern: str) -> str:
         number = r"\d+"
         kinds = {
-            "camera": _any_of([*self.cameras, number], 1),
-            "light": _any_of([*self.lights, number], 1),
-            "projector": _any_of([*self.projectors, number], 1),
+            "camera": _any_of([*self.cameras, _numbered("cam(?:era)?", self.cameras)], 1),
+            "light": _any_of([*self.lights, _numbered("light", self.lights)], 1),
+            "projector": _any_of([*self.projectors, _numbered("proj", self.projectors)], 1),
             "exposure": _any_of(
                 [*self._settings.exposures, r"\d+[-_]\d+|\d+(?:\.\d+)?(?:e-?\d+)?"], 1
             ),
@@ -338,17 +338,19 @@ class _Names:
         return _Match(path, camera, light, projector, row, number, exposure)
 
     def _light(self, text: str) -> str | None:
-        first = self._settings.first_light
-        if first is None or not text.isdigit():
+        first, number = self._settings.first_light, re.search(r"\d+$", text)
+        if first is None or number is None or (text in self.lights and not text.isdigit()):
             return self._name(text, self.lights)
-        index = int(text) - first
+        index = int(number[0]) - first
         return self.lights[index] if 0 <= index < len(self.lights) else None
 
     def _name(self, text: str | None, names: list[str]) -> str | None:
         if text is None or text in names:
             return text
-        ends = [re.search(r"(\d+)$", n) for n in names]
-        same = [n for n, e in zip(names, ends, strict=True) if e and int(e[1]) == int(text)]
+        word, number = _split(text)
+        numbered = [(n, *_split(n)) for n in names if n[-1:].isdigit()]
+        own = {word} & {w for _, w, _ in numbered}
+        same = [n for n, w, k in numbered if k == number and (not own or w == word)]
         return same[0] if len(same) == 1 else None
 
     def _seconds(self, text: str) -> float:
@@ -391,6 +393,19 @@ class _Names:
             f"{folder}: no file matches {pattern!r} with a camera of {_few(self.cameras)} and a "
             f"light of {_few(self.lights)}; found {_few(pictures)}: give --pictures a pattern"
         )
+
+
+def _split(name: str) -> tuple[str, int]:
+    """A name that ends in a number, without it, and the number."""
+    word = name.rstrip("0123456789")
+    return word, int(name[len(word) :])
+
+
+def _numbered(kind: str, names: Sequence[str]) -> str:
+    """A regular expression for a number, alone or after `kind` or the words of `names`: 7, 07 and
+    light_7 for light_07."""
+    words = sorted({re.escape(_split(n)[0]) for n in names if n[-1:].isdigit()})
+    return rf"(?:{'|'.join([*words, rf'(?i:{kind})[ _-]?'])})?\d+"
 
 
 def _any_of(choices: Sequence[str], plain: int) -> str:

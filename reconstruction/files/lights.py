@@ -1,15 +1,18 @@
 """Files of light positions: `.json`, `.csv`, `.txt`, `.npy`, `.obj`, `.pc`.
 
 `.json`: a list of positions, an object of positions by name, or a list under `lights`,
-`light_positions` or `positions`; a light may be an object with `position` and optionally `name` (or
-`id`), `intensity`, `colocated_camera`. `.csv` and `.txt`: optional name, x, y, z, optional
-intensity; optional header line; with semicolons as separators, commas are decimal. `.npy`: (N, 3).
-`.obj`, `.pc`: lines `v x y z`.
+`light_positions` or `positions`; a light may be an object with `position` (or x, y and z) and
+optionally `name` (or `id`), `intensity`, `colocated_camera`. `.csv` and `.txt`: the same columns by
+the names in a header line, else an optional name, x, y, z, optional intensity; with semicolons as
+separators, commas are decimal. A unit is stated as in `x_mm`, `x [cm]`, `"position_mm"` or
+`"units": {"position": "mm"}`. `.npy`: (N, 3). `.obj`, `.pc`: lines `v x y z`.
 """
 
 from __future__ import annotations
 
 import csv
+import re
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +20,19 @@ from typing import Any
 import numpy as np
 
 from reconstruction.arrays import Array
-from reconstruction.containment import is_file_name, plain_file
+from reconstruction.containment import is_file_name
 from reconstruction.files.numpy_files import read_array
 from reconstruction.geometry.lights import Light
-from reconstruction.reading import read_json
+from reconstruction.reading import read_json, read_text
+
+METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+METRES |= {"inch": 0.0254, "inche": 0.0254, "foot": 0.3048, "feet": 0.3048, "centimetre": 0.01}
+METRES |= {"centimeter": 0.01, "millimetre": 0.001, "millimeter": 0.001}
+"""By name without a plural's s."""
+_UNIT = rf"(?:[ _.]*[ _.\[(](?P<unit>(?:{'|'.join(METRES)})s?)[\])]?)?"
+_PLACE = re.compile(rf"(?:p|(?:position|pos)?[ _.]*)(?P<axis>[xyz]|position){_UNIT}")
+_NAME = re.compile("(?:light|lamp|led)?[ _]*(?:name|id|label|number|index|no)|light|lamp|led|#")
+_COLOUR = re.compile(r"(?:intensity[ _.]*)?(r|g|b|red|green|blue)")
 
 
 class LightFileError(ValueError):
@@ -31,12 +43,14 @@ class LightFileError(ValueError):
 class LightFile:
     """Lights in the file's units and axes; `notes` are for the user.
 
-    `directions` is whether all are at distance 1 from the origin.
+    `directions` is whether all are at distance 1 from the origin; `metres` the length of the unit
+    that the file states, None without one.
     """
 
     lights: list[Light]
     notes: list[str] = field(default_factory=list)
     directions: bool = False
+    metres: float | None = None
 
 
 def read_lights(path: str | Path) -> LightFile:
@@ -61,7 +75,12 @@ def read_lights(path: str | Path) -> LightFile:
         raise LightFileError(f"{path}: no lights")
     lights, notes = [], []
     for i, entry in enumerate(entries):
-        lights.append(_light(entry, i, f"{path}: light {i + 1}"))
+        lights.append(_light(entry, i, f"{path}: {entry.get('where', f'light {i + 1}')}"))
+    if unused := Counter(key for entry in entries for key in entry.get("unused", ())):
+        notes.append(f"{path}: not used of its lights: {', '.join(unused)}")
+    units = {entry.get("metres") for entry in entries}
+    if len(units) > 1:
+        raise LightFileError(f"{path}: some positions have a unit and others another or none")
     names = [light.name for light in lights]
     if twice := {n for n in names if names.count(n) > 1}:
         raise LightFileError(f"{path}: two lights have the name {sorted(twice)[0]!r}")
@@ -75,7 +94,22 @@ def read_lights(path: str | Path) -> LightFile:
     if not any(with_intensity):
         notes.append("the file of lights has no intensities: all are 1, units are relative")
     away = np.linalg.norm([light.position for light in lights], axis=1)
-    return LightFile(lights, notes, len(lights) > 1 and bool(np.abs(away - 1).max() < 1e-4))
+    (unit,) = units
+    alike = len(lights) > 1 and bool(np.abs(away - 1).max() < 1e-4)
+    return LightFile(lights, notes, alike and unit is None, unit)
+
+
+def light_name(name: Any) -> Any:
+    """`light_007` of 7, "07" and "7.0"; other names as they are."""
+    if isinstance(name, str):
+        name = name.strip()
+        if re.fullmatch(r"[0-9]{1,9}(\.0*)?", name):
+            name = float(name)
+    if isinstance(name, float) and name.is_integer():
+        name = int(name)
+    if isinstance(name, int) and not isinstance(name, bool) and name >= 0:
+        return f"light_{name:03d}"
+    return name
 
 
 def from_directions(lights: list[Light], center: Array, distance: float) -> list[Light]:
@@ -84,9 +118,7 @@ def from_directions(lights: list[Light], center: Array, distance: float) -> list
 
 
 def _light(entry: dict[str, Any], i: int, where: str) -> Light:
-    name = entry.get("name", entry.get("id", i))
-    if isinstance(name, int) and not isinstance(name, bool) and name >= 0:
-        name = f"light_{name:03d}"
+    name = light_name(entry.get("name", entry.get("id", i)))
     if not isinstance(name, str) or not is_file_name(name):
         raise LightFileError(f"{where}: {name!r} is not a valid name")
     position = _three(entry.get("position"), f"{where} ({name}): position")
@@ -115,21 +147,57 @@ def _three(value: Any, where: str, spread: bool = False) -> Array:
 
 
 def _json(path: Path) -> list[dict[str, Any]]:
-    data = read_json(path)
+    data, unit = read_json(path), None
     if isinstance(data, dict):
+        unit = _unit(data, path)
         for key in ("lights", "light_positions", "positions", "directions"):
             if key in data:
                 data = data[key]
                 break
     if isinstance(data, dict):
-        return [{"name": k, **_entry(v)} for k, v in data.items()]
+        data = [
+            {"name": k, **(v if isinstance(v, dict) else {"position": v})} for k, v in data.items()
+        ]
     if not isinstance(data, list):
         raise LightFileError(f"{path}: expected a list of lights, got {type(data).__name__}")
-    return [_entry(v) for v in data]
+    return [_entry(v, path, unit) for v in data]
 
 
-def _entry(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {"position": value}
+def _unit(data: dict[str, Any], path: Path) -> float | None:
+    """Metres of the unit that an object states for its positions."""
+    unit = data.get("units", data.get("unit"))
+    if isinstance(unit, dict):
+        unit = unit.get("position")
+    return None if unit is None else _metres(unit, path)
+
+
+def _metres(unit: Any, path: Path) -> float:
+    word = str(unit).strip().lower()
+    if (length := METRES.get(word, METRES.get(word.removesuffix("s")))) is None:
+        raise LightFileError(f"{path}: unknown unit {unit!r}: give one of {', '.join(METRES)}")
+    return length
+
+
+def _entry(value: Any, path: Path, unit: float | None) -> dict[str, Any]:
+    """A light's fields; its position in the file's unit, `metres` of that if it is stated."""
+    if not isinstance(value, dict):
+        return {"position": value, "metres": unit}
+    places = {k: m for k in value if (m := _PLACE.fullmatch(k.strip().lower()))}
+    axes = {m["axis"]: k for k, m in places.items()}
+    out = {k: v for k, v in value.items() if k in ("name", "id", "intensity", "colocated_camera")}
+    if len(axes) != len(places) or ("position" in axes and len(axes) > 1):
+        raise LightFileError(f"{path}: {', '.join(places)} give a position twice")
+    if set(axes) == set("xyz"):
+        out["position"] = [value[axes[a]] for a in "xyz"]
+    elif "position" in axes:
+        out["position"] = value[axes["position"]]
+    out["unused"] = [k for k in value if k not in out and k not in axes.values()]
+    stated = {m["unit"] for m in places.values()}
+    if len(stated) > 1:
+        raise LightFileError(f"{path}: {', '.join(places)}: expected one unit for x, y and z")
+    word = next(iter(stated), None)
+    out["metres"] = unit if word is None else _metres(word, path)
+    return out
 
 
 def _npy(path: Path) -> list[dict[str, Any]]:
@@ -143,35 +211,67 @@ def _npy(path: Path) -> list[dict[str, Any]]:
 
 
 def _vertices(path: Path) -> list[dict[str, Any]]:
-    lines = (line.split() for line in plain_file(path).read_text().splitlines())
-    return [{"position": [float(w) for w in words[1:4]]} for words in lines if words[:1] == ["v"]]
+    """Lines `v x y z`; what else an OBJ has places nothing."""
+    out = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if words[:1] == ["v"]:
+            out.append({"position": [_float(w, path, number) for w in words[1:4]]})
+    return out
 
 
 def _table(path: Path) -> list[dict[str, Any]]:
-    text = plain_file(path).read_text(encoding="utf-8-sig")  # byte order mark of spreadsheets
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if any(";" in line for line in lines):  # decimal commas
-        rows = list(csv.reader([x.replace(",", ".") for x in lines], delimiter=";"))
-    elif any("," in line for line in lines):
-        rows = list(csv.reader(lines, skipinitialspace=True))
-    else:
-        rows = [line.split() for line in lines]
-    if rows and {"x", "y", "z"} <= {w.strip().lower() for w in rows[0]}:
-        columns = [w.strip().lower() for w in rows.pop(0)]
-        return [_named_row(dict(zip(columns, row, strict=False)), path) for row in rows]
-    return [_row(row, path, i + 1) for i, row in enumerate(rows)]
+    lines = [(n, x) for n, x in enumerate(read_text(path).splitlines(), 1) if x.strip(" \t,;")]
+    rows = [(n, x) for n, x in lines if not x.lstrip().startswith("#")]
+    decimal_comma = any(";" in x for _, x in rows)
+    between = next((c for c in (";", ",", "\t") if any(c in x for _, x in rows)), None)
 
+    def cells(line: str) -> list[str]:
+        if between is None:
+            return line.split()
+        return [
+            w.strip() for w in next(csv.reader([line], delimiter=between, skipinitialspace=True))
+        ]
 
-def _named_row(row: dict[str, str], path: Path) -> dict[str, Any]:
-    out: dict[str, Any] = {"position": [_float(row.get(k, ""), path) for k in "xyz"]}
-    name = row.get("name") or row.get("id") or row.get("light")
-    if name:
-        out["name"] = int(name) if name.strip().isdecimal() else name.strip()
-    if {"r", "g", "b"} <= set(row):
-        out["intensity"] = [_float(row[k], path) for k in "rgb"]
-    elif row.get("intensity"):
-        out["intensity"] = _float(row["intensity"], path)
+    # NumPy and COLMAP write the header as a comment
+    for number, line in lines if rows else []:
+        if number > rows[0][0]:
+            break
+        columns = [w.lower() for w in cells(line.lstrip(" \t#"))]
+        if len(set("xyz") & {m["axis"] for w in columns if (m := _PLACE.fullmatch(w))}) == 3:
+            values = [(n, x) for n, x in rows if n > number]
+            return [_named_row(columns, cells(x), path, n, decimal_comma) for n, x in values]
+    out = []
+    for number, line in rows:
+        words = [w.replace(",", ".") if decimal_comma else w for w in cells(line)]
+        out.append(_row(words, path, number))
     return out
+
+
+def _named_row(
+    columns: list[str], words: list[str], path: Path, line: int, decimal_comma: bool
+) -> dict[str, Any]:
+    while len(words) > len(columns) and not words[-1]:
+        words.pop()
+    if len(words) != len(columns) or len(set(columns)) != len(columns):
+        raise LightFileError(
+            f"{path}: line {line} has {len(words)} columns, the header has {', '.join(columns)}"
+        )
+    row: dict[str, Any] = {}
+    for column, word in zip(columns, words, strict=True):
+        number = word.replace(",", ".") if decimal_comma else word
+        colour = _COLOUR.fullmatch(column)
+        if _NAME.fullmatch(column) and word and "name" not in row:
+            row["name"] = word
+        elif _PLACE.fullmatch(column):
+            row[column] = _float(number, path, line)
+        elif colour or (column == "intensity" and word):
+            row[f"intensity {colour[1][0]}" if colour else column] = _float(number, path, line)
+        elif word:
+            row[column] = word
+    if {f"intensity {c}" for c in "rgb"} <= set(row):
+        row["intensity"] = [row.pop(f"intensity {c}") for c in "rgb"]
+    return _entry(row, path, None) | {"where": f"line {line}"}
 
 
 def _no_name(word: str) -> bool:
@@ -183,29 +283,32 @@ def _no_name(word: str) -> bool:
 
 
 def _row(words: list[str], path: Path, line: int) -> dict[str, Any]:
-    out: dict[str, Any] = {}
+    out: dict[str, Any] = {"where": f"line {line}"}
     if len(words) in (4, 7):
-        name = words[0].strip()
-        if len(words) == 4 and _no_name(name):
+        if len(words) == 4 and _no_name(words[0]):
             raise LightFileError(
-                f"{path}: row {line}: {name} is ambiguous, a name or x: add a header line (x, y, "
-                "z, intensity)"
+                f"{path}: line {line}: {words[0]} is ambiguous, a name or x: add a header line (x, "
+                "y, z, intensity)"
             )
-        out["name"], words = int(name) if name.isdecimal() else name, words[1:]
+        out["name"], words = words[0], words[1:]
     if len(words) not in (3, 6):
         raise LightFileError(
-            f"{path}: row {line} has {len(words)} columns; expected x, y, z with an optional name "
-            "before and red, green and blue intensity after"
+            f"{path}: line {line} has {len(words)} columns; expected x, y, z with an optional name "
+            "before and red, green and blue intensity after, or a header line that names the "
+            "columns, as id,x_mm,y_mm,z_mm"
         )
-    numbers = [_float(w, path) for w in words]
+    numbers = [_float(w, path, line) for w in words]
     out["position"] = numbers[:3]
     if len(numbers) == 6:
         out["intensity"] = numbers[3:]
     return out
 
 
-def _float(word: str, path: Path) -> float:
+def _float(word: str, path: Path, line: int) -> float:
     try:
         return float(word)
     except ValueError:
-        raise LightFileError(f"{path}: expected a number, got {word!r}") from None
+        raise LightFileError(
+            f"{path}: line {line}: expected a number, got {word!r}; a header names the columns x, "
+            "y and z, with a unit as in x_mm"
+        ) from None

@@ -12,12 +12,9 @@ import numpy as np
 from reconstruction.arrays import Array
 from reconstruction.containment import plain_file
 from reconstruction.files.numpy_files import read_array
+from reconstruction.files.ply import read_ply
 
 SUFFIXES = (".obj", ".ply", ".csv", ".npy")
-_KINDS = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
-_KINDS |= {"i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64"}
-_KIND_OF = {name: kind for kind, names in _KINDS.items() for name in names.split()}
-_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_points(path: str | Path) -> tuple[Array, Array | None]:
@@ -79,39 +76,11 @@ def _csv(path: Path) -> Array:
 
 
 def _ply(path: Path) -> Array:
-    """The vertices of a PLY; they must be its first element."""
-    data = path.read_bytes()
-    head, end, body = data.partition(b"end_header")
-    lines = [line.split() for line in head.decode("ascii").splitlines()]
-    if not end or lines[:1] != [["ply"]]:
-        raise ValueError("no PLY header")
-    body = body.partition(b"\n")[2]
-    form = next((line[1] for line in lines if line[:1] == ["format"]), "none")
-    if form not in _ORDERS:
-        raise ValueError(f"format {form!r}; expected one of {', '.join(_ORDERS)}")
-    elements = [i for i, line in enumerate(lines) if line[:1] == ["element"]]
-    if not elements or lines[elements[0]][1] != "vertex":
-        raise ValueError("the first element must be 'vertex'")
-    count = int(lines[elements[0]][2])
-    stop = elements[1] if len(elements) > 1 else len(lines)
-    properties = [line[1:] for line in lines[elements[0] : stop] if line[:1] == ["property"]]
-    if any(p[0] not in _KIND_OF for p in properties):
-        raise ValueError("a vertex has a property that is not a number")
-    order = _ORDERS[form]
-    names = [p[-1] for p in properties]
+    """The vertices of a PLY, with their normals."""
+    vertices = read_ply(path).get("vertex", {})
     wanted = ["x", "y", "z"]
-    if not set(wanted) <= set(names):
-        raise ValueError(f"a vertex has {names}, expected x, y and z")
-    if {"nx", "ny", "nz"} <= set(names):
+    if not set(wanted) <= set(vertices):
+        raise ValueError(f"a vertex has {list(vertices)}, expected x, y and z")
+    if {"nx", "ny", "nz"} <= set(vertices):
         wanted += ["nx", "ny", "nz"]
-    if order is None:
-        numbers = np.array(body.split()[: count * len(names)], np.float64)
-        if len(numbers) < count * len(names):
-            raise ValueError(f"{len(numbers)} numbers for {count} vertices of {len(names)}")
-        table = numbers.reshape(count, len(names))
-        return table[:, [names.index(n) for n in wanted]]
-    kind = np.dtype([(n, order + _KIND_OF[p[0]]) for n, p in zip(names, properties, strict=True)])
-    if len(body) < count * kind.itemsize:
-        raise ValueError(f"{len(body)} bytes for {count} vertices of {kind.itemsize}")
-    rows = np.frombuffer(body, kind, count)
-    return np.stack([rows[n].astype(np.float64) for n in wanted], axis=1)
+    return np.stack([vertices[n].astype(np.float64) for n in wanted], axis=1)

@@ -10,9 +10,12 @@ import numpy as np
 
 from reconstruction.arrays import Array
 from reconstruction.geometry.light_profiles import LightProfile, Photometry, Unit
+from reconstruction.reading import read_text
 
-VERSIONS = {"IESNA91": 1991, "IES:LM-63-2019": 2019}  # by first line; a file of 1986 has none
-VERSIONS |= {f"IESNA:LM-63-{year}": year for year in (1991, 1995, 2002)}
+EDITIONS = {"1986": 1986, "86": 1986, "1991": 1991, "91": 1991, "1995": 1995, "95": 1995}
+EDITIONS |= {"2002": 2002, "02": 2002, "2019": 2019, "19": 2019}
+_FIRST = re.compile(r"(?:IES|IESNA|ANSI/?IES):?(?:LM-?63-?)?(\d+)")  # a file of 1986 has none
+_TILT = re.compile(r"\s*TILT\s*=\s*(.*)", re.IGNORECASE)
 _PHOTOMETRY: dict[int, Photometry] = {1: "C", 2: "B", 3: "A"}
 _MILLIWATTS = re.compile(r"\bmw\s*/\s*sr\b|\bmilliwatts?\b", re.IGNORECASE)
 
@@ -35,12 +38,12 @@ def read_ies(
         raise ValueError(f"unit must be 'cd' or 'mW/sr', got {unit!r}")
     path = Path(path)
     try:
-        lines = path.read_bytes().decode("latin-1").splitlines()
+        lines = read_text(path, "latin-1").splitlines()
     except OSError as error:
         raise IesError(f"{path}: cannot be read: {error.strerror}") from error
     start, version = _labels(path, lines)
     numbers = _Numbers(path, lines, start + 1)
-    how = lines[start].split("=", 1)[1].strip().upper()
+    how = lines[start].partition("=")[2].strip().upper()
     tilt = _tilt(numbers) if how == "INCLUDE" else None
     if how not in ("NONE", "INCLUDE"):
         raise IesError(
@@ -59,6 +62,11 @@ def read_ies(
     photometric_factor = numbers.take("ballast-lamp photometric factor", 0.0)
     if version <= 1995:  # later editions keep the place for something that is no factor
         multiplier *= photometric_factor
+    if multiplier == 0:
+        raise numbers.wrong(
+            f"the factors of an edition of {version} multiply all candela values by 0; if the file "
+            "is of 2002 or later, its first line must say so: IESNA:LM-63-2002"
+        )
     numbers.take("input watts")
     if tilt is not None:
         multiplier *= float(np.interp(tilt_deg, tilt[:, 0], tilt[:, 1]))
@@ -79,23 +87,20 @@ def read_ies(
 
 
 def _labels(path: Path, lines: list[str]) -> tuple[int, int]:
-    """Index of the TILT= line, and the edition."""
-    tilt = next((i for i, s in enumerate(lines) if s.strip().upper().startswith("TILT=")), None)
+    """Index of the TILT= line, and the edition by the first line that is not blank."""
+    tilt = next((i for i, line in enumerate(lines) if _TILT.match(line)), None)
     if tilt is None:
         raise IesError(f"{path}, line {len(lines)}: no line starts with TILT=: not an LM-63 file")
-    first = lines[0].strip().upper() if tilt else ""
-    version = VERSIONS.get(first, 1986)
-    if version == 1986:
-        if re.match(r"IES(NA)?:?\s*(LM-63|\d\d)", first):
-            known = list(VERSIONS)
-            raise IesError(f"{path}, line 1: edition {first!r} is unknown; known are {known}")
-        return tilt, version
-    for number, line in enumerate(lines[1:tilt], 2):
-        if line.strip() and not re.match(r"\s*\[[^\]]*\]", line):
-            raise IesError(
-                f"{path}, line {number}: expected a [KEYWORD] line or TILT=, got {line!r}"
-            )
-    return tilt, version
+    number, first = next((n, x) for n, x in enumerate(lines, 1) if x.strip())
+    found = _FIRST.match("".join(first.split()).upper())
+    if found is None:
+        return tilt, 1986
+    if found[1] not in EDITIONS:
+        raise IesError(
+            f"{path}, line {number}: edition {first.strip()!r} is unknown; known are "
+            f"{', '.join(EDITIONS)}"
+        )
+    return tilt, EDITIONS[found[1]]
 
 
 class _Numbers:

@@ -113,6 +113,30 @@ class Strands:
         confidence = None if self.confidence is None else self.confidence[take]
         return Strands(self.points[take], offsets, radius, confidence)
 
+    def at_most(self, count: int) -> Strands:
+        """The strands, those of more points resampled to `count` at equal arc lengths.
+
+        Radius and confidence are interpolated.
+        """
+        counts = np.diff(self.offsets)
+        long = np.flatnonzero(counts > count)
+        if not len(long):
+            return self
+        vary = [self.radius if isinstance(self.radius, np.ndarray) else None, self.confidence]
+        columns = [c[:, None] for c in vary if c is not None]
+        values = np.hstack([self.points, *columns]).astype(np.float64)
+        parts = np.split(values, self.offsets[1:-1])
+        for i in long:
+            step = np.linalg.norm(np.diff(parts[i][:, :3], axis=0), axis=1)
+            arc = np.concatenate([[0], np.cumsum(step)])
+            at = np.linspace(0, arc[-1], count)
+            parts[i] = np.stack([np.interp(at, arc, column) for column in parts[i].T], axis=1)
+        offsets = np.concatenate([[0], np.cumsum(np.minimum(counts, count))])
+        out = iter(np.concatenate(parts).astype(np.float32).T[3:])
+        radius, confidence = (old if old is None else next(out) for old in vary)
+        points = np.concatenate(parts)[:, :3].astype(np.float32)
+        return Strands(points, offsets, self.radius if radius is None else radius, confidence)
+
     def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> Strands:
         """The strands moved by `x -> rotation (3, 3) @ x + translation (3,)`."""
         moved = self.points.astype(float) @ np.asarray(rotation, float).T + np.asarray(translation)

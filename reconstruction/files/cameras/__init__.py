@@ -1,4 +1,4 @@
-"""Camera files of COLMAP, Metashape, nerfstudio, OpenCV and The Captury.
+"""Camera files of COLMAP, Metashape, nerfstudio, OpenCV, EasyMocap and The Captury.
 
     file = read_cameras("sparse/0")
     file.cameras, file.notes
@@ -19,8 +19,10 @@ from reconstruction.files.cameras.errors import CameraFile, CameraFileError
 from reconstruction.files.cameras.metashape import read_metashape
 from reconstruction.files.cameras.nerfstudio import read_transforms
 from reconstruction.files.cameras.opencv import (
+    EASYMOCAP,
     SUFFIXES,
     cameras_from,
+    read_easymocap,
     read_opencv,
     read_opencv_folder,
 )
@@ -30,7 +32,7 @@ __all__ = ["CameraFile", "CameraFileError", "read_cameras"]
 
 _KNOWN = (
     "a COLMAP model (cameras and images, .txt or .bin), transforms.json, Metashape's .xml, "
-    "OpenCV's .yml or .xml, a map of cameras in .json, .calib"
+    "OpenCV's .yml or .xml, EasyMocap's intri.yml and extri.yml, a map of cameras in .json, .calib"
 )
 
 
@@ -51,7 +53,9 @@ def _read(path: Path) -> CameraFile:
     if path.is_dir():
         return _read_folder(path)
     if path.name in ("cameras.txt", "images.txt", "cameras.bin", "images.bin"):
-        return read_colmap(path.parent)
+        return read_colmap(path.parent, path.suffix)
+    if path.name in EASYMOCAP and all((path.parent / name).is_file() for name in EASYMOCAP):
+        return read_easymocap(path.parent)
     if not path.exists():
         raise CameraFileError(f"{path}: no such file or folder")
     if path.suffix == ".json":
@@ -72,6 +76,8 @@ def _read_folder(path: Path) -> CameraFile:
             return read_colmap(folder)
     if (path / "transforms.json").is_file():
         return _read(path / "transforms.json")
+    if all((path / name).is_file() for name in EASYMOCAP):
+        return read_easymocap(path)
     if files := sorted(f for f in path.iterdir() if f.suffix in SUFFIXES):
         return read_opencv_folder(path, files)
     raise CameraFileError(f"{path}: no camera file found; expected {_KNOWN}")

@@ -6,8 +6,8 @@ Poses map world to camera, x right, y down, z forward; the corner of the top-lef
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,15 +24,26 @@ from reconstruction.files.cameras.errors import (
     pinhole_K,
 )
 from reconstruction.geometry.lens_models import LensModel
+from reconstruction.reading import read_text
+
+OFF_UNIT = 0.01
+"""Difference of a quaternion's length from 1 that is noted."""
 
 MODELS = (
     *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
     *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4)),
-    *(("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12)),
+    *(("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)),
 )
 """Names and parameter counts, by COLMAP's model number."""
 _COUNTS = dict(MODELS)
-_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE")
+_ONE_FOCAL = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+)
+_OTHERS = ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")
 
 
 @dataclass(frozen=True)
@@ -51,16 +62,22 @@ class _Image:
     name: str
 
 
-def read_colmap(folder: Path) -> CameraFile:
-    """The images of a model in `folder` (`.txt` or `.bin`) as cameras.
+def read_colmap(folder: Path, suffix: str = "") -> CameraFile:
+    """The images of a model in `folder` as cameras, from its `.txt` or `.bin` by `suffix`.
 
-    Raises `CameraFileError` naming the file and the line or byte.
+    Without one the binary files come first, as COLMAP has it. Raises `CameraFileError` naming the
+    file and the line or byte.
     """
-    if (folder / "cameras.txt").is_file():
-        lenses, images = _text_cameras(folder / "cameras.txt"), _text_images(folder / "images.txt")
+    notes: list[str] = []
+    there = [s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()]
+    if not suffix and len(there) == 2:
+        notes.append(f"{folder}: the model's .bin files are read, its .txt files are not")
+    if (suffix or there[0]) == ".txt":
+        lenses = _text_cameras(folder / "cameras.txt", notes)
+        images = _text_images(folder / "images.txt", notes)
     else:
         lenses = _binary_cameras(folder / "cameras.bin")
-        images = list(_binary_images(folder / "images.bin"))
+        images = _binary_images(folder / "images.bin")
     if not images:
         raise CameraFileError(f"{folder}: the model has no registered image")
     cameras = []
@@ -69,12 +86,17 @@ def read_colmap(folder: Path) -> CameraFile:
     ):
         if image.camera not in lenses:
             raise CameraFileError(f"{image.where}: no camera {image.camera} in {[*lenses]}")
-        if not np.linalg.norm(image.quaternion) > 0:
+        norm = float(np.linalg.norm(image.quaternion))
+        if not norm > 0:
             raise CameraFileError(f"{image.where}: a quaternion of length 0 is no rotation")
+        if abs(norm - 1) > OFF_UNIT:
+            notes.append(f"{image.where}: the quaternion has length {norm:.4g}; it is normalised")
         lens = lenses[image.camera]
         R = Rotation.from_quat(np.roll(image.quaternion, -1)).as_matrix()
         cameras.append(camera_of(image.where, name, lens.size, lens.K, (R, image.t), lens.lens))
-    return CameraFile(cameras, unitless=True)
+    if unused := set(lenses) - {image.camera for image in images}:
+        notes.append(f"{folder}: no image is of the cameras {', '.join(map(str, sorted(unused)))}")
+    return CameraFile(cameras, notes, unitless=True)
 
 
 def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[float]) -> _Intrinsics:
@@ -84,7 +106,7 @@ def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[floa
         raise CameraFileError(
             f"{where}: {model} has {_COUNTS[model]} parameters, got {len(params)}"
         )
-    if model in ("FOV", "THIN_PRISM_FISHEYE"):
+    if model in _OTHERS:
         raise CameraFileError(
             f"{where}: OpenCV has no lens model {model}: undistort the images with "
             "`colmap image_undistorter` and import its model"
@@ -98,17 +120,21 @@ def _intrinsics(where: str, model: str, size: tuple[int, int], params: list[floa
     return _Intrinsics(size, pinhole_K(fx, fy, cx, cy), lens)
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Position and words of each line without comments; blank lines are kept."""
+def _lines(path: Path) -> list[tuple[str, str]]:
+    """Position and text of each line; blank lines and comments are kept."""
     try:
-        text = plain_file(path).read_text()
+        text = read_text(path)
     except FileNotFoundError:
         raise CameraFileError(f"{path}: no such file; a COLMAP model needs it") from None
-    except UnicodeDecodeError as error:
-        raise CameraFileError(f"{path}: not text ({error})") from error
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.startswith("#"):
-            yield f"{path}, line {number}", line.split()
+    return [(f"{path}, line {n}", line.strip()) for n, line in enumerate(text.split("\n"), 1)]
+
+
+def _check_count(lines: list[tuple[str, str]], count: int, notes: list[str]) -> None:
+    """Note a comment such as `# Number of images: 6` that differs from `count`."""
+    for where, line in lines:
+        found = re.match(r"#\s*Number of (images|cameras):\s*(\d+)", line)
+        if found and int(found[2]) != count:
+            notes.append(f"{where}: the file claims {found[2]} {found[1]}, it has {count}")
 
 
 def _numbers(where: str, words: list[str]) -> list[float]:
@@ -124,36 +150,50 @@ def _whole(where: str, word: str) -> int:
     return int(word)
 
 
-def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
-    out = {}
-    for where, words in _lines(path):
-        if not words:
+def _text_cameras(path: Path, notes: list[str]) -> dict[int, _Intrinsics]:
+    out: dict[int, _Intrinsics] = {}
+    lines = _lines(path)
+    for where, line in lines:
+        words = line.split()
+        if not words or line.startswith("#"):
             continue
         if len(words) < 5:
             raise CameraFileError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS...")
         size = _whole(where, words[2]), _whole(where, words[3])
-        out[_whole(where, words[0])] = _intrinsics(
-            where, words[1], size, _numbers(where, words[4:])
-        )
+        number = _whole(where, words[0])
+        if number in out:
+            raise CameraFileError(f"{where}: the camera {number} occurs twice")
+        out[number] = _intrinsics(where, words[1], size, _numbers(where, words[4:]))
+    _check_count(lines, len(out), notes)
     return out
 
 
-def _text_images(path: Path) -> list[_Image]:
-    """Alternating lines: an image, then its points, possibly blank."""
-    out = []
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_IMAGE = re.compile(rf"(\d+)((?:\s+{_NUMBER}){{7}})\s+(\d+)\s+(\S.*)")
+_POINTS = re.compile(rf"(?:{_NUMBER}\s+{_NUMBER}\s+(?:-1|\d+)(?:\s+|$))+")
+
+
+def _text_images(path: Path, notes: list[str]) -> list[_Image]:
+    """Images; a line of the points of an image may follow it, blank or not, or be left out."""
+    out: list[_Image] = []
     lines = _lines(path)
-    for where, words in lines:
-        if not words:
+    after_image = False
+    for where, line in lines:
+        if line.startswith("#"):
             continue
-        if len(words) < 10:
+        points, image = _POINTS.fullmatch(line), _IMAGE.fullmatch(line)
+        skipped = not line or (points and after_image)
+        after_image = not skipped
+        if skipped:
+            continue
+        if points or not image:
             raise CameraFileError(
-                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, "
-                f"got {len(words)} words"
+                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, or the points (X "
+                f"Y POINT3D_ID)... of an image, got {len(line.split())} words: {line[:60]!r}"
             )
-        values = np.array(_numbers(where, words[1:8]))
-        name = " ".join(words[9:])
-        out.append(_Image(where, values[:4], values[4:], _whole(where, words[8]), name))
-        next(lines, None)
+        values = np.array([float(w) for w in image[2].split()])
+        out.append(_Image(where, values[:4], values[4:], int(image[3]), image[4]))
+    _check_count(lines, len(out), notes)
     return out
 
 
@@ -186,24 +226,37 @@ class _Bytes:
         raw, self.at = self.data[self.at : end], end + 1
         return raw.decode("utf-8", "backslashreplace")
 
+    def end(self) -> None:
+        """Raise `CameraFileError` for bytes after the last record."""
+        if self.at < len(self.data):
+            raise CameraFileError(
+                f"{self.path}: the {len(self.data) - self.at:,} bytes from byte {self.at:,} on "
+                "belong to no record: its count is wrong, or it is no COLMAP model"
+            )
+
 
 def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
-    file, out = _Bytes(path), {}
+    file, out = _Bytes(path), dict[int, _Intrinsics]()
     for _ in range(int(file.take("Q")[0])):
         where = f"{path}, byte {file.at:,}"
         number, model, width, height = (int(v) for v in file.take("iiQQ"))
         if not 0 <= model < len(MODELS):
             raise CameraFileError(f"{where}: the camera model {model} is unknown")
         name, count = MODELS[model]
+        if number in out:
+            raise CameraFileError(f"{where}: the camera {number} occurs twice")
         out[number] = _intrinsics(where, name, (width, height), list(file.take(f"{count}d")))
+    file.end()
     return out
 
 
-def _binary_images(path: Path) -> Iterator[_Image]:
-    file = _Bytes(path)
+def _binary_images(path: Path) -> list[_Image]:
+    file, out = _Bytes(path), []
     for _ in range(int(file.take("Q")[0])):
         where = f"{path}, byte {file.at:,}"
         _, *values, camera = file.take("i7di")
         name = file.word()
         file.skip(24 * int(file.take("Q")[0]))
-        yield _Image(where, np.array(values[:4]), np.array(values[4:]), int(camera), name)
+        out.append(_Image(where, np.array(values[:4]), np.array(values[4:]), int(camera), name))
+    file.end()
+    return out

@@ -19,6 +19,10 @@ CameraAxes = Literal["opencv", "opengl"]
 """x right, y down, z forward; or x right, y up, z backwards."""
 
 
+EXACT, FEW_DIGITS = 1e-7, 1e-3
+"""Difference of R Rᵀ from 1 up to which R is used as it is, and is a rotation of few digits."""
+
+
 class CameraFileError(ValueError):
     """An invalid camera file; the message names the file, the position and what to do."""
 
@@ -67,8 +71,14 @@ def camera_of(
 ) -> Camera:
     """A `Camera` if it can represent the lens, else a `LensModelCamera`.
 
-    `size` is (width, height), `pose` (R, t). Raises `CameraFileError`.
+    `size` is (width, height), `pose` (R, t); an R of few digits becomes the nearest rotation.
+    Raises `CameraFileError`.
     """
+    R, t = pose
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if EXACT < off < FEW_DIGITS and np.linalg.det(R) > 0:
+        U, _, V = np.linalg.svd(R)
+        pose = U @ V, t
     try:
         plain = _plain(lens)
         if plain is not None:

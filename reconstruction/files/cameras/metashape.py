@@ -1,7 +1,8 @@
 """Metashape's exported cameras, `.xml` (Metashape manual, "Camera models"; Export Cameras).
 
 A camera's transform maps camera (x right, y down, z forward) to chunk; the component's or the
-chunk's maps that to the world: X = scale · R x + t. The corner of the top-left pixel is at (0, 0);
+chunk's maps that to the world: X = scale · R x + t. In a rig, the rotation and location of a
+sensor map its cameras to their master. The corner of the top-left pixel is at (0, 0);
 cx and cy are relative to the image centre.
 """
 
@@ -45,27 +46,61 @@ def read_metashape(path: Path, root: Element) -> CameraFile:
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
     components = {c.get("id"): c.find("transform") for c in chunk.iterfind("components/component")}
     notes, metres = _unit(path, chunk)
-    entries = [c for c in chunk.iterfind("cameras//camera") if c.get("enabled") != "false"]
-    posed = [c for c in entries if c.find("transform") is not None]
-    absent = [c.get("label", "?") for c in entries if c.find("transform") is None]
+    every = chunk.findall("cameras//camera")
+    by_id = {c.get("id"): c for c in every}
+    posed: list[tuple[Element, Element]] = []
+    left: dict[str, list[str]] = {}
+    for camera in every:
+        master = camera
+        if camera.find("transform") is None:  # of a rig
+            master = by_id.get(camera.get("master_id"), camera)
+        if camera.get("enabled") in ("false", "0"):
+            left.setdefault("disabled", []).append(camera.get("label", "?"))
+        elif master.find("transform") is None:
+            left.setdefault("not aligned", []).append(camera.get("label", "?"))
+        else:
+            posed.append((camera, master))
     if not posed:
         raise CameraFileError(
             f"{path}: no camera is aligned (has a transform): align cameras first"
         )
-    if absent:
-        notes.append(f"{path}: not aligned, skipped: {', '.join(absent)}")
-    names = camera_names([c.get("label", "") for c in posed], str(path))
+    worlds = {m.get("component_id") for _, m in posed}
+    alone = {w for w in worlds if components.get(w) is None and w in components}
+    if len(worlds) > 1 and alone:
+        active = chunk.find("components").get("active_id")  # type: ignore[union-attr]
+        kept = active if active in worlds else posed[0][1].get("component_id")
+        left[f"in another component than {kept}, without a transform to it"] = [
+            c.get("label", "?") for c, m in posed if m.get("component_id") != kept
+        ]
+        posed = [(c, m) for c, m in posed if m.get("component_id") == kept]
+    elif len(worlds) > 1:
+        notes.append(f"{path}: {len(worlds)} components, each placed by its own transform")
+    notes += [f"{path}: {why}, skipped: {', '.join(names)}" for why, names in left.items()]
+    names = camera_names([c.get("label", "") for c, _ in posed], str(path))
     cameras = []
     scaled = False
-    for element, name in zip(posed, names, strict=True):
+    for (element, master), name in zip(posed, names, strict=True):
         where = f"{path}: camera {name}"
         sensor = sensors.get(element.get("sensor_id"))
         if sensor is None:
             raise CameraFileError(f"{where}: there is no sensor {element.get('sensor_id')!r}")
-        world = components.get(element.get("component_id"))
+        world = components.get(master.get("component_id"))
         world = world if world is not None else chunk.find("transform")
         scaled |= world is not None and world.find("scale") is not None
-        cameras.append(_camera(where, name, sensor, element, world))
+        pose = _matrix(master, where)
+        if master is not element:
+            if sensor.find("rotation") is None and sensor.find("location") is None:
+                notes.append(f"{where}: its sensor has no offset, it is placed at its rig's master")
+            offset = np.eye(4)
+            offset[:3, :3] = _inner(sensor, "rotation", 9, np.eye(3), where).reshape(3, 3)
+            offset[:3, 3] = _inner(sensor, "location", 3, np.zeros(3), where)
+            pose = pose @ offset
+        if element.findtext("orientation", "1").strip() != "1":
+            notes.append(
+                f"{where}: its photographs have the orientation {element.findtext('orientation')}, "
+                "its calibration is of pixels that are not turned by it"
+            )
+        cameras.append(_camera(where, name, sensor, pose, world))
     if not scaled:
         notes.append(f"{path}: the chunk has no scale: its unit is arbitrary")
     return CameraFile(cameras, notes, metres)
@@ -108,9 +143,14 @@ def _calibration(sensor: Element) -> Element | None:
     return found.get("adjusted", found.get("initial", next(iter(found.values()), None)))
 
 
-def _camera(
-    where: str, name: str, sensor: Element, element: Element, world: Element | None
-) -> Camera:
+def _matrix(element: Element, where: str) -> Array:
+    pose = _numbers(element.findtext("transform"), 16, f"{where}: <transform>").reshape(4, 4)
+    if not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
+        raise CameraFileError(f"{where}: <transform>: expected a last row of 0 0 0 1")
+    return pose
+
+
+def _camera(where: str, name: str, sensor: Element, pose: Array, world: Element | None) -> Camera:
     calibration = _calibration(sensor)
     if calibration is None:
         raise CameraFileError(f"{where}: its sensor has no calibration")
@@ -126,7 +166,6 @@ def _camera(
         raise CameraFileError(f"{where}: a fisheye with p1, p2 is not supported: fix them to 0")
     values = [_value(calibration, t, where) for t in (_FISHEYE if fisheye else _LENS)]
     lens = LensModel("fisheye" if fisheye else "metashape", np.array(values))
-    pose = _numbers(element.findtext("transform"), 16, f"{where}: <transform>").reshape(4, 4)
     R, center = pose[:3, :3], pose[:3, 3]
     if world is not None:
         turn = _inner(world, "rotation", 9, np.eye(3), where).reshape(3, 3)
@@ -139,7 +178,7 @@ def _camera(
 
 def _inner(world: Element, tag: str, count: int, default: Array, where: str) -> Any:
     text = world.findtext(tag)
-    return default if text is None else _numbers(text, count, f"{where}: its world's <{tag}>")
+    return default if text is None else _numbers(text, count, f"{where}: <{tag}>")
 
 
 def _size(where: str, calibration: Element, sensor: Element) -> tuple[int, int]:

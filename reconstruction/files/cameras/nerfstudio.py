@@ -25,9 +25,14 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens_models import LensModel
 
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "w", "h")
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "w", "h")
 _OPENCV = ("k1", "k2", "p1", "p2", "k3")
 _FISHEYE = ("k1", "k2", "k3", "k4")
+_FIELDS = (*_INTRINSICS, *_OPENCV, "k4", "k5", "k6", "camera_model", "is_fisheye")
+_NOTED = {
+    "applied_transform": "applied_transform is in its poses: results are in its frame",
+    "applied_scale": "applied_scale is in its poses: results are in its unit",
+}
 _PLAIN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
@@ -39,13 +44,19 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
     frames = data["frames"]
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise CameraFileError(f"{path}: frames: expected a list with at least one object")
+    notes = [f"{path}: {text}" for key, text in _NOTED.items() if key in data]
+    if masks := sum("mask_path" in frame for frame in frames):
+        notes.append(f"{path}: {masks} frames have a mask_path, not used: give pictures.subject")
     groups: dict[bytes, list[str]] = {}
     found: dict[bytes, tuple[str, dict[str, Any], Array]] = {}
     for i, frame in enumerate(frames):
         where = f"{path}: frames[{i}]"
         matrix = _matrix(frame, where)
         fields = {**data, **frame}
-        lens = [fields.get(f) for f in (*_INTRINSICS, *_OPENCV, "k4")]
+        lens = [fields.get(f) for f in _FIELDS]
+        if twice := [f for f in _FIELDS if f in data and frame.get(f, data[f]) != data[f]]:
+            both = ", ".join(f"{f} {frame[f]} (all frames: {data[f]})" for f in twice)
+            notes.append(f"{where}: its own {both} are used")
         key = matrix.tobytes() + repr(lens).encode()
         picture = frame.get("file_path")
         if not isinstance(picture, str) or not picture:
@@ -58,7 +69,7 @@ def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
         _camera(path, name, groups[key][0], *found[key])
         for key, name in zip(found, names, strict=True)
     ]
-    return CameraFile(cameras, axes="opengl", unitless=True)
+    return CameraFile(cameras, notes, axes="opengl", unitless=True)
 
 
 def _shared(pictures: list[str]) -> str:
@@ -83,6 +94,8 @@ def _matrix(frame: dict[str, Any], where: str) -> Array:
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise CameraFileError(f"{where}.transform_matrix: expected 4x4 finite numbers")
+    if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
+        raise CameraFileError(f"{where}.transform_matrix: expected a last row of 0, 0, 0, 1")
     return matrix[:3]
 
 
@@ -96,7 +109,10 @@ def _number(fields: dict[str, Any], name: str, where: str, default: float | None
 def _size(path: Path, picture: str, fields: dict[str, Any], where: str) -> tuple[int, int]:
     """Width and height from the file, else from the image."""
     if "w" in fields and "h" in fields:
-        return int(_number(fields, "w", where)), int(_number(fields, "h", where))
+        sizes = [_number(fields, name, where) for name in "wh"]
+        if not all(size.is_integer() for size in sizes):
+            raise CameraFileError(f"{where}: w and h must be whole numbers, got {sizes}")
+        return int(sizes[0]), int(sizes[1])
     for suffix in ("", ".png", ".jpg", ".exr"):
         there = path.parent / (picture + suffix)
         if there.is_file():
@@ -117,17 +133,25 @@ def _camera(
     if "fl_x" in fields:
         fx = _number(fields, "fl_x", where)
     else:
-        angle = _number(fields, "camera_angle_x", where)
-        if not 0 < angle < np.pi:
-            raise CameraFileError(f"{where}: camera_angle_x must lie in (0, π), got {angle}")
-        fx = 0.5 * width / np.tan(angle / 2)
-    fy = _number(fields, "fl_y", where, fx)
+        fx = _focal(fields, "camera_angle_x", width, where)
+    if "fl_y" not in fields and "fl_x" not in fields and "camera_angle_y" in fields:
+        fy = _focal(fields, "camera_angle_y", height, where)
+    else:
+        fy = _number(fields, "fl_y", where, fx)
     K = pinhole_K(
         fx, fy, _number(fields, "cx", where, width / 2), _number(fields, "cy", where, height / 2)
     )
     lens = _lens(fields, fisheye, where)
     R = _TO_OPENCV @ matrix[:, :3].T
     return camera_of(where, name, size, K, (R, -R @ matrix[:, 3]), lens)
+
+
+def _focal(fields: dict[str, Any], name: str, size: int, where: str) -> float:
+    """The focal length in pixels from a field of view across `size` pixels, in radians."""
+    angle = _number(fields, name, where)
+    if not 0 < angle < np.pi:
+        raise CameraFileError(f"{where}: {name} must lie in (0, π), got {angle}")
+    return float(0.5 * size / np.tan(angle / 2))
 
 
 def _lens(fields: dict[str, Any], fisheye: bool, where: str) -> LensModel:

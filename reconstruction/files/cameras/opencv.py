@@ -1,16 +1,17 @@
 """Calibrations of `cv::FileStorage` (`.yml`, `.xml`, `.json`) and similar JSON.
 
-One file per camera in a folder, or one with a map per camera. `K` or `camera_matrix`; `dist` or
-`distortion_coefficients` in OpenCV's order; `R` (a rotation or Rodrigues vector) or `rvec`, and `T`
-or `tvec`, map world to camera; `pose` (4, 4) maps camera to world. The centre of the top-left pixel
-is at (0, 0).
+One file per camera in a folder, one with a map per camera, or EasyMocap's `intri.yml` and
+`extri.yml`, whose fields end in a camera's name (`K_01`, `Rot_01`, `T_01`). `K` or `camera_matrix`;
+`dist` or `distortion_coefficients` in OpenCV's order; `R` (a rotation or Rodrigues vector) or
+`rvec`, and `T` or `tvec`, map world to camera; `pose` (4, 4) maps camera to world. The centre of
+the top-left pixel is at (0, 0).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -19,15 +20,23 @@ from scipy.spatial.transform import Rotation
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name, plain_file
 from reconstruction.files.cameras.errors import CameraFile, CameraFileError, camera_of
+from reconstruction.files.pictures import FORMATS, picture_size
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens_models import LensModel
 
 _K = ("K", "camera_matrix", "Camera_Matrix", "cameraMatrix", "intrinsic")
 _DIST = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist", "D")
 _R = ("R", "rotation", "rotation_matrix", "rvec", "Rot")
+_TURNS = ((3, 3), (3, 1), (1, 3), (3,))
 _T = ("T", "t", "translation", "tvec")
 _WIDTH, _HEIGHT = ("image_width", "width", "image_Width"), ("image_height", "height")
-_FISHEYE = ("fisheye", "equidistant", "OPENCV_FISHEYE", "kannala_brandt")
+_FISHEYE = ("fisheye", "equidistant", "opencv_fisheye", "kannala_brandt", "equi")
+_PLAIN = {"", "none", "opencv", "full_opencv", "pinhole", "simple_pinhole", "perspective", "frame"}
+_PLAIN |= {"plumb_bob", "radtan", "brown", "brown_conrady", "radial", "simple_radial", "standard"}
+_PLAIN |= {"rational", "rational_polynomial", "thin_prism"}
+EASYMOCAP = ("intri.yml", "extri.yml")
+SAME_TURN = 1e-3
+"""Largest difference between a rotation matrix and a Rodrigues vector of one camera."""
 SUFFIXES = (".yml", ".yaml", ".xml")
 
 
@@ -43,6 +52,57 @@ def read_opencv_folder(folder: Path, files: list[Path]) -> CameraFile:
     """A camera from each file."""
     read = [read_opencv(file) for file in files]
     return CameraFile([c for r in read for c in r.cameras], [n for r in read for n in r.notes])
+
+
+def read_easymocap(folder: Path) -> CameraFile:
+    """The cameras of `intri.yml` and `extri.yml`, in the order of their `names`.
+
+    Without `W_` and `H_` the size is that of a camera's first image in `images/NAME`, beside the
+    files or one folder up.
+    """
+    inner, outer = (_storage(folder / name) for name in EASYMOCAP)
+    where = str(folder / EASYMOCAP[0])
+    there = [key.removeprefix("K_") for key in inner if key.startswith("K_")]
+    listed = inner.get("names", outer.get("names"))
+    names = [_text(name) for name in listed] if isinstance(listed, list) else there
+    by_number = {name.lstrip("0"): name for name in there}  # YAML reads 01 as the number 1
+    names = [n if n in there else by_number.get(n, n) for n in names if n != "none"]
+    if not names:
+        raise CameraFileError(f"{where}: expected names, and K_NAME of each")
+    cameras = []
+    known: set[str] = set()
+    for name in names:
+        table = {
+            key.removesuffix(f"_{name}"): value
+            for key, value in (*inner.items(), *outer.items())
+            if key.endswith(f"_{name}")
+        }
+        known |= {f"{key}_{name}" for key in table}
+        size = [table.pop(key, None) for key in "WH"]
+        if not all(isinstance(value, float) and value > 0 for value in size):
+            size = list(_size_of_images(folder, name))
+        table |= dict(zip(("width", "height"), size, strict=True))
+        cameras.append(camera_from(f"{where}: {name}", name, table))
+    left = [key for key in (*inner, *outer) if key not in known and key != "names"]
+    notes = [f"{folder}: not used: {', '.join(dict.fromkeys(left))}"] if left else []
+    if bare := [name for name in names if not {f"dist_{name}", f"D_{name}"} & known]:
+        notes.append(f"{where}: no distortion of {', '.join(bare)}: 0 is assumed")
+    return CameraFile(cameras, notes)
+
+
+def _text(name: Any) -> str:
+    return f"{name:.0f}" if isinstance(name, float) else str(name)
+
+
+def _size_of_images(folder: Path, name: str) -> tuple[int, int]:
+    for images in (folder / "images" / name, folder.parent / "images" / name):
+        for file in sorted(images.iterdir()) if is_file_name(name) and images.is_dir() else ():
+            if file.suffix.lower() in FORMATS:
+                return picture_size(file)
+    raise CameraFileError(
+        f"{folder}: {name}: unknown image size: add W_{name} and H_{name} to {EASYMOCAP[0]}, or "
+        f"images/{name}"
+    )
 
 
 def cameras_from(path: Path, data: Mapping[str, Any]) -> CameraFile:
@@ -65,23 +125,42 @@ def camera_from(where: str, name: str, table: Mapping[str, Any]) -> Camera:
     K = _array(where, table, _K, ((3, 3),))
     size = _size(where, table)
     dist = _array(where, table, _DIST, None) if any(f in table for f in _DIST) else np.zeros(0)
-    model = str(table.get("model", table.get("camera_model", table.get("distortion_model", ""))))
-    lens = LensModel("fisheye" if model in _FISHEYE else "opencv", dist.ravel())
+    lens = LensModel(_kind(where, table, dist), dist.ravel())
     return camera_of(where, name, size, K, _pose(where, table), lens)
+
+
+def _kind(where: str, table: Mapping[str, Any], dist: Array) -> Literal["opencv", "fisheye"]:
+    """By the names of the model, or the flag that OpenCV's calibration program writes."""
+    given = (table.get(f) for f in ("model", "camera_model", "distortion_model"))
+    names = [str(name).strip().lower() for name in given if name is not None]
+    if table.get("fisheye_model") or any(name in _FISHEYE for name in names):
+        return "fisheye"
+    unknown = [name for name in names if name not in _PLAIN]
+    if unknown and dist.any():
+        raise CameraFileError(
+            f"{where}: the lens model {unknown[0]!r} is not OpenCV's: undistort the images"
+        )
+    return "opencv"
 
 
 def _pose(where: str, table: Mapping[str, Any]) -> tuple[Array, Array]:
     if "pose" in table:
         pose = _array(where, table, ("pose",), ((4, 4), (3, 4)))
+        if not np.allclose(pose[3:], (0, 0, 0, 1), atol=1e-6):
+            raise CameraFileError(f"{where}: pose: expected a last row of 0, 0, 0, 1")
         R = pose[:3, :3].T
         return R, -R @ pose[:3, 3]
     if not any(f in table for f in _R) or not any(f in table for f in _T):
         raise CameraFileError(
             f"{where}: no pose: give R (or rvec) and T (or tvec), world to camera"
         )
-    R = _array(where, table, _R, ((3, 3), (3, 1), (1, 3), (3,)))
-    if R.size == 3:
-        R = Rotation.from_rotvec(R.ravel()).as_matrix()
+    given = [_array(where, table, (f,), _TURNS) for f in _R if f in table]
+    turns = [r if r.size == 9 else Rotation.from_rotvec(r.ravel()).as_matrix() for r in given]
+    R = turns[0]
+    for other in turns[1:]:
+        if np.abs(other - R).max() > SAME_TURN:
+            names = " and ".join(f for f in _R if f in table)
+            raise CameraFileError(f"{where}: {names} are different rotations: remove one")
     return R, _array(where, table, _T, ((3, 1), (1, 3), (3,))).ravel()
 
 

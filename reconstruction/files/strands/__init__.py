@@ -1,4 +1,4 @@
-"""Strand files in and out: `.npz`, cyHair `.hair`, USD curves; TressFX `.tfx` and USC `.data` in;
+"""Strand files in and out: `.npz`, cyHair `.hair`, USD curves; `.tfx`, USC `.data` and `.ply` in;
 Alembic curves out.
 
     strands = read_strands("groom.hair")
@@ -21,6 +21,7 @@ from reconstruction.files.strands.cyhair import read_hair, write_hair
 from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.files.strands.npz import read_npz, read_npz_poses, write_npz
 from reconstruction.files.strands.photobooth import read_data
+from reconstruction.files.strands.ply import read_ply_strands
 from reconstruction.files.strands.tressfx import read_tfx
 from reconstruction.geometry.strands import Strands
 
@@ -50,6 +51,7 @@ def _write_usd(path: Path, strands: Strands) -> None:
 
 _READERS: dict[str, Callable[[Path], Strands]] = {
     **{".npz": read_npz, ".hair": read_hair, ".tfx": read_tfx, ".data": read_data},
+    ".ply": read_ply_strands,
     **dict.fromkeys(_USD, _read_usd),
 }
 _WRITERS: dict[str, Callable[[Path, Strands], None]] = {
@@ -78,6 +80,7 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
     if reader is None:
         raise StrandFileError(
             f"{path}: unknown strand format {path.suffix!r}; readable are {', '.join(READABLE)}"
+            + (": save Alembic curves as USD" if path.suffix.lower() == ".abc" else "")
         )
     if not path.is_file():
         raise StrandFileError(f"{path}: no such file")

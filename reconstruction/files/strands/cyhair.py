@@ -4,6 +4,9 @@ A 128-byte little-endian header, then the arrays in its flags, in this order: se
 (uint16), points (3 float32), thickness, transparency (float32 per point) and colour (3 float32 per
 point). `thickness` is twice the radius. Transparency and colour are not read. The magics "HAIR" (of
 the specification) and "hair" are read, "HAIR" is written.
+
+Without a header, as MonoHair and others write them, and of exactly the size that its counts need:
+strands and points (uint32), points or segments per strand (uint16), points (3 float32).
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.arrays import Floats, Ints
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.errors import StrandFileError, require_finite
+from reconstruction.files.strands.errors import StrandFileError, radii, require_finite
 from reconstruction.geometry.strands import Strands
 
 HEADER = struct.Struct("<4s4I5f88s")
@@ -24,13 +28,15 @@ INFORMATION = b"hairstage: metres, z up, roots first; thickness is twice the rad
 
 
 def read_hair(path: Path) -> Strands:
-    """Read a `.hair` file; strands without a segment are skipped.
+    """Read a `.hair` file, with or without a header; strands without a segment are skipped.
 
-    A missing or non-positive thickness becomes the default radius.
+    A thickness of 0 becomes `THINNEST`, a missing one the default radius.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(HEADER.size)
+        if head[:4].upper() != b"HAIR" and (found := _headerless(path, head, size)):
+            return found
         if len(head) < HEADER.size:
             raise StrandFileError(f"{len(head)} bytes, a .hair header has {HEADER.size}: truncated")
         magic, strands, points, flags, default_segments, thickness, *_ = HEADER.unpack(head)
@@ -67,18 +73,35 @@ def read_hair(path: Path) -> Strands:
         width = np.full(points, thickness, np.float32)
         if flags & THICKNESS:
             width = np.frombuffer(file.read(4 * points), "<f4")
-    keep = np.repeat(segments > 0, segments + 1)
-    counts = (segments + 1)[segments > 0]
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Strands(xyz[keep], offsets, _radius(width[keep]))
+    return _strands(xyz, segments, radii(width))
 
 
-def _radius(width: np.ndarray) -> float | np.ndarray:
-    """Radii from widths: a scalar if all are equal, the default if invalid."""
-    if len(width) == 0 or not (np.isfinite(width).all() and (width > 0).all()):
-        return 4e-5
-    half = (width / 2).astype(np.float32)
-    return float(half[0]) if (half == half[0]).all() else half
+def _headerless(path: Path, head: bytes, size: int) -> Strands | None:
+    """The strands of a file without a header, None if its counts do not make up its size."""
+    if len(head) < 8:
+        return None
+    strands, points = struct.unpack_from("<2I", head)
+    start = 8 + 2 * strands
+    if size != start + 12 * points:
+        return None
+    raw = path.read_bytes()
+    counts = np.frombuffer(raw, "<u2", strands, 8).astype(np.int64)
+    if counts.sum() + strands == points:
+        counts = counts + 1
+    if counts.sum() != points:
+        return None
+    xyz = np.frombuffer(raw, "<f4", 3 * points, start).reshape(-1, 3)
+    require_finite(xyz, range(start, size, 12))
+    return _strands(xyz, counts - 1, None)
+
+
+def _strands(xyz: Floats, segments: Ints, radius: float | Floats | None) -> Strands:
+    """Strands of points `(N, 3)`, without those of no segment."""
+    keep = np.repeat(segments > 0, np.maximum(segments + 1, 0))
+    offsets = np.concatenate([[0], np.cumsum(segments[segments > 0] + 1)]).astype(np.int64)
+    if radius is None:
+        return Strands(xyz[keep], offsets)
+    return Strands(xyz[keep], offsets, radius if isinstance(radius, float) else radius[keep])
 
 
 def write_hair(path: Path, strands: Strands) -> None:

@@ -1,9 +1,9 @@
 """USD `BasisCurves` through `usd-core`.
 
 Written are linear curves with `curveVertexCounts`, `points`, `widths` (twice the radius) and, if
-known, the primvar `confidence` per point, z up, in metres. Read are all linear `BasisCurves` of a
-stage, except those with purpose "guide", in the world frame, converted to z up and metres.
-Cubic curves are refused: their control points are not on the hair.
+known, the primvar `confidence` per point, z up, in metres. Read are all `BasisCurves` of a stage,
+except those with purpose "guide", in the world frame, converted to z up and metres; cubic ones as
+polylines on the curve.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.errors import StrandFileError
+from reconstruction.files.strands.curves import on_curve, segment_counts
+from reconstruction.files.strands.errors import StrandFileError, radii
 from reconstruction.geometry.strands import Strands
 
 _START = Usd.TimeCode.EarliestTime()
@@ -25,7 +26,7 @@ _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def read_usd(path: Path) -> Strands:
-    """Read all linear `BasisCurves` of a stage, metres, z up, at the start of an animation."""
+    """Read all `BasisCurves` of a stage, metres, z up, at the start of an animation."""
     try:
         return _read(Usd.Stage.Open(str(path)))
     except Tf.ErrorException as error:  # also of values, which are read lazily
@@ -41,23 +42,27 @@ def _read(stage: Any) -> Strands:
     curves = (UsdGeom.BasisCurves(prim) for prim in prims)
     hair = (c.GetPrim() for c in curves if c and c.ComputePurpose() != UsdGeom.Tokens.guide)
     found = [_curves(prim, cache, turn) for prim in hair]
+    others = (UsdGeom.NurbsCurves, UsdGeom.HermiteCurves)
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if any(prim.IsA(kind) for kind in others):
+            raise StrandFileError(
+                f"{prim.GetPath()}: {prim.GetTypeName()} are not read: convert them to BasisCurves"
+            )
     if not found:
         raise StrandFileError("no BasisCurves in this stage")
-    points, counts, radius = (np.concatenate(part) for part in zip(*found, strict=True))
+    points, counts, widths = (np.concatenate(part) for part in zip(*found, strict=True))
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    if len(radius) == 0:
-        return Strands(points, offsets)
-    same = bool((radius == radius[0]).all())
-    return Strands(points, offsets, float(radius[0]) if same else radius)
+    radius = radii(widths)
+    return Strands(points, offsets) if radius is None else Strands(points, offsets, radius)
 
 
-def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
-    """Points in metres, vertex counts and per-point radii of one prim."""
+def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Array]:
+    """Points in metres, vertex counts and widths of the points of one prim."""
     curves = UsdGeom.BasisCurves(prim)
     where = prim.GetPath()
-    if curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear:
-        raise StrandFileError(f"{where}: only linear curves are supported; convert cubic ones")
-    if curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
+    cubic = curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear
+    wrap, basis = curves.GetWrapAttr().Get(), curves.GetBasisAttr().Get() if cubic else "linear"
+    if wrap == UsdGeom.Tokens.periodic:
         raise StrandFileError(f"{where}: closed (periodic) curves are not strands")
     points = np.asarray(curves.GetPointsAttr().Get(_START) or [], np.float64).reshape(-1, 3)
     counts = np.asarray(curves.GetCurveVertexCountsAttr().Get(_START) or [], np.int64)
@@ -70,24 +75,58 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Floats]:
     linear = to_world[:3, :3] @ turn.T
     world = points @ linear + to_world[3, :3] @ turn.T
     scale = abs(np.linalg.det(linear)) ** (1 / 3)
-    widths = np.asarray(curves.GetWidthsAttr().Get(_START) or [], np.float64) * scale
+    widths, interpolation = _widths(curves)
+    if not (np.isfinite(widths) & (widths >= 0)).all():
+        raise StrandFileError(f"{where}: widths must be 0 or more, got {widths.min():g}")
+    widths = widths * scale
     if len(widths) == 0:
-        widths = np.full(len(points), 8e-5)
-    elif len(widths) == 1:
+        widths, interpolation = np.array([8e-5]), UsdGeom.Tokens.constant
+    pinned = wrap == UsdGeom.Tokens.pinned
+    segments = segment_counts(basis, counts, pinned)
+    if segments is None:
+        raise StrandFileError(
+            f"{where}: cubic {basis} curves of {int(counts.min())} to {int(counts.max())} points "
+            "do not end at a segment's end"
+        )
+    sizes = {"constant": 1, "uniform": len(counts), "varying": int((segments + 1).sum())}
+    sizes |= {"vertex": len(points)}
+    if sizes.get(interpolation) != len(widths):
+        fits = [
+            name
+            for name in ("constant", "vertex", "varying", "uniform")
+            if sizes[name] == len(widths)
+        ]
+        if not fits:
+            raise StrandFileError(
+                f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
+            )
+        interpolation = fits[0]
+    if interpolation == "constant":
         widths = np.repeat(widths, len(points))
-    elif len(widths) == len(counts) and len(counts) != len(points):
+    elif interpolation == "uniform":
         widths = np.repeat(widths, counts)
-    elif len(widths) != len(points):
-        raise StrandFileError(
-            f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
-        )
-    thin = int((~(widths > 0)).sum())
-    if thin:
-        raise StrandFileError(
-            f"{where}: {thin} of {len(widths)} widths are not above 0: give strands a width at all "
-            "points"
-        )
-    return world.astype(np.float32), counts, (widths / 2).astype(np.float32)
+    if basis == "linear":
+        return world.astype(np.float32), counts, widths
+    varying = widths if interpolation == "varying" else None
+    world, counts, widths = on_curve(
+        basis,
+        world,
+        counts,
+        np.zeros(len(points)) if varying is not None else widths,
+        pinned,
+        varying,
+    )
+    return world.astype(np.float32), counts, np.maximum(widths, 0)
+
+
+def _widths(curves: Any) -> tuple[Array, str]:
+    """Widths and their interpolation; the primvar comes before the attribute (UsdGeomCurves)."""
+    primvar = UsdGeom.PrimvarsAPI(curves).GetPrimvar("widths")
+    if primvar and primvar.HasValue():
+        values, interpolation = primvar.ComputeFlattened(_START), primvar.GetInterpolation()
+    else:
+        values, interpolation = curves.GetWidthsAttr().Get(_START), curves.GetWidthsInterpolation()
+    return np.asarray(values or [], np.float64), str(interpolation)
 
 
 def write_usd(path: Path, strands: Strands) -> None:

@@ -144,7 +144,8 @@ def _write(
     if args.to == "unreal":
         from appearance.export.unreal import export_unreal
 
-        export_unreal(groom, out)
+        for note in export_unreal(groom, out):
+            output.note(note)
         return [out]
     if args.to == "gltf":
         from appearance.export.cards import export_gltf

@@ -204,6 +204,41 @@ def test_usd_textures_hold_the_maps_where_st_looks_them_up(mapped, tmp_path):
         np.testing.assert_allclose(sigma_a[:, at], texture[row, column], rtol=1e-5)
 
 
+@pytest.mark.parametrize("limits", [{}, {"MOST_STRANDS": 25}, {"MOST_GROUP_POINTS": 30 * 255}])
+def test_unreal_gets_what_its_groups_hold(fitted, tmp_path, monkeypatch, limits):
+    """255 points a strand with both ends, every strand in one of the groups."""
+    pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
+    from alembic3d import Abc, AbcGeom
+
+    for name, value in limits.items():
+        monkeypatch.setattr(f"appearance.export.unreal.{name}", value)
+    lines = [np.linspace(s[0], s[-1], 400) for s in (fitted.strands[i] for i in range(60))]
+    groom = Groom.of(replace(fitted, strands=Strands.from_list(lines)), ExportOptions(guides=5))
+    notes = export_unreal(groom, tmp_path / "g.abc")
+    assert notes[0].startswith("60 strands have over 255 points")
+    assert len(notes) == 1 + bool(limits)
+    top, found, ids = Abc.IArchive(str(tmp_path / "g.abc")).getTop(), [], []
+    names = [top.getChild(i).getName() for i in range(top.getNumChildren())]
+    hair = sorted(n for n in names if n.startswith("hair"))
+    for group, name in enumerate(hair):
+        schema = AbcGeom.ICurves(top, name).getSchema()
+        counts = np.asarray(memoryview(schema.getValue().getCurvesNumVertices()))
+        assert set(counts) == {255}
+        found.append(np.array(memoryview(schema.getValue().getPositions())).reshape(-1, 255, 3))
+        held = schema.getArbGeomParams()
+        for param, into in (("groom_group_id", []), ("groom_id", ids)):
+            into += list(AbcGeom.IInt32GeomParam(held, param).getExpandedValue().getVals())
+            assert param != "groom_group_id" or into == [group]
+    assert [len(f) for f in found] == {0: [60], 25: [25, 25, 10], 7650: [30, 30]}[
+        next(iter(limits.values()), 0)
+    ]
+    assert ids == list(range(60))
+    every = np.concatenate(found) / 100
+    for k, end in ((0, 0), (-1, -1)):
+        expected = [line[end] for line in lines]
+        np.testing.assert_allclose(every[:, k], expected, atol=1e-6)
+
+
 def test_unreal_alembic_is_in_centimetres_with_its_attributes(fitted, tmp_path, monkeypatch):
     pytest.importorskip("imath", reason="the extra 'alembic' is not installed")
     from alembic3d import Abc, AbcGeom

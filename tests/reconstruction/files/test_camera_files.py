@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,19 +20,6 @@ from reconstruction.geometry.lens_models import LensModel, LensModelCamera
 from reconstruction.geometry.placement import PlacementOptions, placed, resized
 
 POINTS = np.random.default_rng(3).uniform(-0.12, 0.12, (200, 3))
-LENS = np.array([-0.12, 0.03, 2e-3, -1e-3, 0.01])
-
-
-def stage() -> list[Camera]:
-    """Six cameras about the origin, tilted, one upright, half of them through a lens."""
-    out = []
-    for i in range(6):
-        angle = 1.1 * i
-        position = [np.cos(angle), np.sin(angle), 0.3 * np.sin(2 * angle)]
-        camera = Camera.look_at(f"cam_{i:02d}", 640, 480, position, [0, 0, 0.01], 30, 17.0 * i)
-        K = camera.K * [[1, 1, 1], [1, 1.01, 1], [1, 1, 1]] + [[0, 0, 4.2], [0, 0, -7.3], [0, 0, 0]]
-        out.append(replace(camera, K=K, distortion=LENS * (i % 2)))
-    return out
 
 
 def assert_same_pixels(found: list[Camera], truth: list[Camera]) -> None:
@@ -60,8 +48,8 @@ WRITERS: dict[str, Callable[[Path, list[Camera]], object]] = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_files_of_others_give_the_same_pixels(name: str, tmp_path: Path) -> None:
-    WRITERS[name](tmp_path / name, stage())
-    assert_same_pixels(read_cameras(tmp_path / name).cameras, stage())
+    WRITERS[name](tmp_path / name, writers.stage())
+    assert_same_pixels(read_cameras(tmp_path / name).cameras, writers.stage())
 
 
 @pytest.mark.parametrize(
@@ -74,7 +62,7 @@ def test_files_of_others_give_the_same_pixels(name: str, tmp_path: Path) -> None
     ],
 )
 def test_lenses_are_opencvs(kind, coefficients) -> None:
-    camera = stage()[1]
+    camera = writers.stage()[1]
     found = LensModelCamera(
         "c", 640, 480, camera.K, camera.R, camera.t, lens=LensModel(kind, np.array(coefficients))
     )
@@ -112,17 +100,17 @@ def test_a_picture_through_another_lens_is_resampled_to_a_pinhole() -> None:
 
 def test_a_calib_file_gives_the_same_pixels_in_millimetres(tmp_path: Path) -> None:
     """It counts pixels in shares of the picture's width: scaled to the pictures they are ours."""
-    writers.write_calib(tmp_path / "cameras.calib", stage())
+    writers.write_calib(tmp_path / "cameras.calib", writers.stage())
     file = read_cameras(tmp_path / "cameras.calib")
     assert file.metres == 0.001
     found = placed(file.cameras, PlacementOptions(unit="mm"), file.axes)
-    named = [replace(c, name=f"Cam{i + 1:02d}") for i, c in enumerate(stage())]
+    named = [replace(c, name=f"Cam{i + 1:02d}") for i, c in enumerate(writers.stage())]
     assert_same_pixels([resized(c, 640, 480) for c in found], named)
 
 
 def test_cameras_not_aligned_by_metashape_give_a_warning(tmp_path: Path) -> None:
     path = tmp_path / "cameras.xml"
-    writers.write_metashape(path, stage())
+    writers.write_metashape(path, writers.stage())
     file = read_cameras(path)
     assert any(note.endswith("not aligned, skipped: lost") for note in file.notes)
     assert file.metres == 1
@@ -158,7 +146,7 @@ def test_files_not_written_by_opencv_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_camera_alone_and_a_map_without_a_camera_in_json(tmp_path: Path) -> None:
-    first, second, *_ = stage()
+    first, second, *_ = writers.stage()
     path = tmp_path / "cameras.json"
     writers.write_map(path, [first, second])
     data = json.loads(path.read_text())
@@ -175,7 +163,7 @@ def test_a_camera_alone_and_a_map_without_a_camera_in_json(tmp_path: Path) -> No
 def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
     """As files have it that list a frame for each camera and light."""
     path = tmp_path / "transforms.json"
-    writers.write_transforms(path, stage())
+    writers.write_transforms(path, writers.stage())
     data = json.loads(path.read_text())
     data["frames"] = [
         {**frame, "file_path": f"images/{frame['file_path'][7:13]}/{k:03d}.png"}
@@ -183,13 +171,13 @@ def test_frames_of_one_pose_are_one_camera(tmp_path: Path) -> None:
         for k in range(3)
     ]
     path.write_text(json.dumps(data))
-    assert_same_pixels(read_cameras(path).cameras, stage())
+    assert_same_pixels(read_cameras(path).cameras, writers.stage())
 
 
 def test_the_fourth_radial_number_of_nerfstudio_goes_with_the_eighth_power(tmp_path: Path) -> None:
     """d = 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸ of nerfstudio's camera_utils; read as OpenCV's
     rational lens, pixels were up to 0.3 off."""
-    path, camera = tmp_path / "transforms.json", stage()[1]
+    path, camera = tmp_path / "transforms.json", writers.stage()[1]
     writers.write_transforms(path, [camera])
     data = json.loads(path.read_text())
     data["frames"][0]["k4"] = k4 = 0.05
@@ -209,7 +197,7 @@ def test_the_fourth_radial_number_of_nerfstudio_goes_with_the_eighth_power(tmp_p
 @pytest.mark.parametrize("suffix", [".exr", ".tif", ".png"])
 def test_pictures_say_how_large_they_are_where_the_file_does_not(suffix, tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
-    writers.write_transforms(path, stage())
+    writers.write_transforms(path, writers.stage())
     data = json.loads(path.read_text())
     for frame in data["frames"]:
         del frame["w"], frame["h"]
@@ -221,12 +209,12 @@ def test_pictures_say_how_large_they_are_where_the_file_does_not(suffix, tmp_pat
         else:
             cv2.imwrite(str(there), np.zeros((480, 640, 3), np.uint8))
     path.write_text(json.dumps(data))
-    assert_same_pixels(read_cameras(path).cameras, stage())
+    assert_same_pixels(read_cameras(path).cameras, writers.stage())
 
 
 def test_file_errors_name_the_problem(tmp_path: Path) -> None:
     folder = tmp_path / "sparse"
-    writers.write_colmap_text(folder, stage())
+    writers.write_colmap_text(folder, writers.stage())
     images, cameras = folder / "images.txt", folder / "cameras.txt"
     good, lenses = images.read_text(), cameras.read_text()
 
@@ -249,14 +237,14 @@ def test_file_errors_name_the_problem(tmp_path: Path) -> None:
     refused("no camera file found; expected a COLMAP model")
     refused("no such file", tmp_path / "nowhere")
     binary = tmp_path / "binary"
-    writers.write_colmap_binary(binary, stage())
+    writers.write_colmap_binary(binary, writers.stage())
     whole = (binary / "images.bin").read_bytes()
     (binary / "images.bin").write_bytes(whole[:-20])
     refused(r"images\.bin: ends at byte .* is truncated", binary)
     (binary / "images.bin").write_bytes(whole[:83] + b"\xff" * 8 + whole[91:])
     refused(r"images\.bin: .*truncated", binary)
     transforms = tmp_path / "transforms.json"
-    writers.write_transforms(transforms, stage())
+    writers.write_transforms(transforms, writers.stage())
     data = json.loads(transforms.read_text())
     del data["frames"][2]["w"]
     transforms.write_text(json.dumps(data))
@@ -264,3 +252,231 @@ def test_file_errors_name_the_problem(tmp_path: Path) -> None:
     data["frames"][1]["transform_matrix"] = [[1, 2], [3]]
     transforms.write_text(json.dumps(data))
     refused(r"frames\[1\]\.transform_matrix: expected 4x4", transforms)
+
+
+COLMAP_DOC = """# Image list with two lines of data per image:
+#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
+#   POINTS2D[] as (X, Y, POINT3D_ID)
+# Number of images: 2, mean observations per image: 2
+1 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180141.JPG
+2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1
+2 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180142.JPG
+1190.83 663.957 23056 1258.77 640.354 59070
+"""
+"""The example of COLMAP's documentation (format.rst)."""
+
+
+def test_the_example_of_colmaps_documentation(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 3072 2304 2559.81 1536 1152\n")
+    (tmp_path / "images.txt").write_text(COLMAP_DOC)
+    file = read_cameras(tmp_path)
+    assert [c.name for c in file.cameras] == ["P1180141", "P1180142"]
+    assert file.notes == []
+    w, x, y, z = 0.851773, 0.0165051, 0.503764, -0.142941
+    R = file.cameras[0].R
+    np.testing.assert_allclose(R[0], [1 - 2 * (y * y + z * z), 2 * (x * y - w * z),
+                                      2 * (x * z + w * y)], atol=1e-5)  # fmt: skip
+    np.testing.assert_allclose(file.cameras[0].center, -R.T @ [-0.737434, 1.02973, 3.74354])
+
+
+def no_points(text: str) -> str:
+    """Each image line alone."""
+    return "\n".join(x for x in text.split("\n") if x.endswith(".jpg") or x[:1] == "#")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        no_points,
+        lambda t: "\ufeff" + t.replace("\n", "\r\n"),
+        lambda t: no_points(t).replace(".jpg", ".jpg\n# of this image\n\n"),
+        lambda t: t.replace(".jpg", ".jpg\n# of this image"),
+        lambda t: t.replace(" cam_", "  my folder/ cam_").replace("my folder/ ", "my  folder/"),
+        lambda t: "# Number of images: 6, mean observations per image: 1\n" + t.replace(" ", "\t"),
+    ],
+)
+def test_images_txt_is_read_by_what_its_lines_are(change, tmp_path: Path) -> None:
+    writers.write_colmap_text(tmp_path / "sparse", writers.stage())
+    path = tmp_path / "sparse/images.txt"
+    path.write_text(change(path.read_text()), encoding="utf-8", newline="")
+    file = read_cameras(tmp_path / "sparse")
+    assert_same_pixels(file.cameras, writers.stage())
+    assert file.notes == []
+
+
+def test_what_a_colmap_model_lacks_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "sparse"
+    writers.write_colmap_text(folder, writers.stage())
+    images, cameras = folder / "images.txt", folder / "cameras.txt"
+    good = images.read_text()
+    images.write_text("# Number of images: 7\n" + good)
+    assert "line 1: the file claims 7 images, it has 6" in read_cameras(folder).notes[0]
+    images.write_text(good.replace("12.5 3.25 -1", "12.5 3.25 -1 4.0"))
+    with pytest.raises(CameraFileError, match="line 6: expected IMAGE_ID"):
+        read_cameras(folder)
+    images.write_text(good)
+    lens = cameras.read_text().splitlines()[1]
+    cameras.write_text(f"{cameras.read_text()}99{lens[2:]}\n")
+    assert "no image is of the cameras 99" in read_cameras(folder).notes[0]
+    cameras.write_text(f"{cameras.read_text()}{lens}\n")
+    with pytest.raises(CameraFileError, match="line 9: the camera 10 occurs twice"):
+        read_cameras(folder)
+    binary = tmp_path / "binary"
+    writers.write_colmap_binary(binary, writers.stage())
+    with (binary / "images.bin").open("ab") as file:
+        file.write(b"left")
+    with pytest.raises(CameraFileError, match=r"4 bytes .* belong to no record"):
+        read_cameras(binary)
+
+
+def test_colmaps_fisheyes_of_one_focal_length(tmp_path: Path) -> None:
+    """RADIAL_FISHEYE has f, cx, cy, k1, k2 (models.h): θ (1 + k1 θ² + k2 θ⁴)."""
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n")
+    (tmp_path / "cameras.txt").write_text("1 RADIAL_FISHEYE 640 480 400 320 240 0.1 0.05\n")
+    (camera,) = read_cameras(tmp_path).cameras
+    angle = np.arctan(0.3)
+    expected = 319.5 + 400 * angle * (1 + 0.1 * angle**2 + 0.05 * angle**4)
+    np.testing.assert_allclose(camera.project(np.array([[0.3, 0, 1]]))[0], [[expected, 239.5]])
+
+
+def test_a_rig_of_metashape_is_component_master_slave(tmp_path: Path) -> None:
+    writers.write_rig(tmp_path / "rig.xml", writers.stage())
+    assert_same_pixels(read_cameras(tmp_path / "rig.xml").cameras, writers.stage())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found", "note"),
+    [
+        ('<camera id="2"', '<camera enabled="0" id="2"', 5, "disabled, skipped: cam_02"),
+        ('component_id="0" master_id="0"\n label="cam_03"', 'label="cam_03"', 5, "not aligned"),
+        ("></camera>", "><orientation>6</orientation></camera>", 6, "orientation 6"),
+        (
+            '<camera id="5" sensor_id="5" component_id="0" master_id="0"\n label="cam_05">',
+            '<camera id="5" sensor_id="0" component_id="1" label="cam_05"><transform>1 0 0 0 0 1 0 '
+            "0 0 0 1 0 0 0 0 1</transform>",
+            5,
+            "in another component than 0, without a transform to it, skipped: cam_05",
+        ),
+    ],
+)
+def test_what_is_not_used_of_metashape_is_named(old, new, found, note, tmp_path: Path) -> None:
+    def change(text: str) -> str:
+        assert old in text
+        text = text.replace(
+            "</component></components>", '</component><component id="1"/></components>'
+        )
+        return text.replace(old, new)
+
+    writers.write_rig(tmp_path / "rig.xml", writers.stage(), change)
+    file = read_cameras(tmp_path / "rig.xml")
+    assert len(file.cameras) == found
+    assert note in " ".join(file.notes)
+
+
+@pytest.mark.parametrize("how", ["plain", "by a file", "matrices", "numbers", "no names", "images"])
+def test_easymocap(how: str, tmp_path: Path) -> None:
+    folder = tmp_path / "calib"
+    writers.write_easymocap(
+        folder, writers.stage(), vectors=how != "matrices", sizes=how != "images"
+    )
+    for file in folder.iterdir():
+        text = file.read_text()
+        if how == "numbers":
+            file.write_text(text.replace('"', ""))
+        if how == "no names":
+            file.write_text("".join(x for x in text.splitlines(True) if "- " not in x[:5]
+                                    and "names" not in x))  # fmt: skip
+    for i in range(6 if how == "images" else 0):
+        (tmp_path / f"images/{i + 1:02d}").mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / f"images/{i + 1:02d}/0.png"), np.zeros((480, 640, 3), np.uint8))
+    found = read_cameras(folder / "intri.yml" if how == "by a file" else folder)
+    assert found.notes == []
+    named = [replace(c, name=f"{i + 1:02d}") for i, c in enumerate(writers.stage())]
+    for camera, truth in zip(found.cameras, named, strict=True):
+        assert camera.name == truth.name
+        expected = cv2.projectPoints(
+            POINTS, cv2.Rodrigues(truth.R)[0], truth.t, truth.K, truth.distortion
+        )[0][:, 0]
+        np.testing.assert_allclose(camera.project(POINTS)[0], expected, atol=5e-3)  # six digits
+
+
+def test_what_easymocap_files_lack_is_named(tmp_path: Path) -> None:
+    writers.write_easymocap(tmp_path / "a", writers.stage(), sizes=False)
+    with pytest.raises(CameraFileError, match="01: unknown image size: add W_01 and H_01"):
+        read_cameras(tmp_path / "a")
+    writers.write_easymocap(tmp_path / "b", writers.stage())
+    intri, extri = tmp_path / "b/intri.yml", tmp_path / "b/extri.yml"
+    intri.write_text(intri.read_text().replace('  - "06"\n', ""))
+    file = read_cameras(tmp_path / "b")
+    assert len(file.cameras) == 5
+    assert "not used: K_06, dist_06, H_06, W_06, R_06, Rot_06, T_06" in file.notes[0]
+    extri.write_text(extri.read_text().replace("Rot_02", "Rot_x").replace("Rot_01", "Rot_02"))
+    with pytest.raises(CameraFileError, match="02: R and Rot are different rotations"):
+        read_cameras(tmp_path / "b")
+
+
+def test_a_lens_is_what_any_of_its_names_says(tmp_path: Path) -> None:
+    """`fisheye_model` of OpenCV's calibration program, kalibr's pair of names, an unknown lens."""
+    writers.write_map(tmp_path / "a.json", writers.stage()[1:2])
+    data = json.loads((tmp_path / "a.json").read_text())
+
+    def read(**fields: object) -> Camera:
+        (name,) = data
+        table = {**data[name], "dist": [0.1, 0.01, 0, 0], **fields}
+        (tmp_path / "b.json").write_text(json.dumps({name: table}))
+        return read_cameras(tmp_path / "b.json").cameras[0]
+
+    fisheyes = [
+        {"fisheye_model": 1},
+        {"camera_model": "pinhole", "distortion_model": "equidistant"},
+    ]
+    for fields in fisheyes:
+        found = read(**fields)
+        assert isinstance(found, LensModelCamera)
+        assert found.lens.kind == "fisheye"
+    assert read(distortion_model="plumb_bob").distortion.tolist() == [0.1, 0.01, 0, 0, 0]
+    with pytest.raises(CameraFileError, match="the lens model 'division' is not OpenCV's"):
+        read(model="division")
+
+
+@pytest.mark.parametrize(
+    ("change", "note"),
+    [
+        (lambda d: d.update(applied_transform=np.eye(4)[:3].tolist()), "applied_transform"),
+        (
+            lambda d: d.update(fl_x=1.0),
+            r"frames\[0\]: its own fl_x .* \(all frames: 1.0\) are used",
+        ),
+        (lambda d: d["frames"][0].update(mask_path="m.png"), "1 frames have a mask_path, not used"),
+        (lambda d: d.update(ply_file_path="sparse_pc.ply", aabb_scale=16), "^$"),
+    ],
+)
+def test_what_nerfstudio_adds_is_named(change, note: str, tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    writers.write_transforms(path, writers.stage())
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    file = read_cameras(path)
+    assert_same_pixels(file.cameras, writers.stage())
+    assert re.search(note, " ".join(file.notes[:1]))
+
+
+def test_fields_of_view_and_a_transposed_matrix_of_nerfstudio(tmp_path: Path) -> None:
+    """Half of 640 over tan 0.3 is 1034.5; half of 480 over tan 0.2 is 1184.0."""
+    path = tmp_path / "transforms.json"
+    writers.write_transforms(path, writers.stage())
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        del frame["fl_x"], frame["fl_y"]
+    data |= {"camera_angle_x": 0.6, "camera_angle_y": 0.4}
+    path.write_text(json.dumps(data))
+    K = read_cameras(path).cameras[0].K
+    assert (K[0, 0], K[1, 1]) == pytest.approx((1034.4725, 1183.9569), rel=1e-6)
+    frame = data["frames"][1]
+    frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    path.write_text(json.dumps(data))
+    with pytest.raises(
+        CameraFileError, match=r"frames\[1\]\.transform_matrix: expected a last row"
+    ):
+        read_cameras(path)

@@ -34,10 +34,10 @@ def test_four_numbers_are_a_name_and_a_place_only_where_the_first_may_be_a_name(
     path.write_text("5 1.0 1.2 0.3\n")
     assert read_lights(path).lights[0].name == "light_005"
     path.write_text("0.5 1.0 1.2 300\n")
-    with pytest.raises(LightFileError, match=r"row 1: 0.5 is ambiguous"):
+    with pytest.raises(LightFileError, match=r"line 1: 0.5 is ambiguous"):
         read_lights(path)
     path.write_text("-812 1500 300 2\n-500 1400 200 2\n")  # whole millimetres
-    with pytest.raises(LightFileError, match=r"row 1: -812 is ambiguous"):
+    with pytest.raises(LightFileError, match=r"line 1: -812 is ambiguous"):
         read_lights(path)
 
 
@@ -53,3 +53,57 @@ def test_a_light_without_an_intensity_beside_others_with_one_is_named(tmp_path, 
     path.write_text(text)
     with pytest.raises(LightFileError, match=r"light 2 \(fill\) has no intensity, others have"):
         read_lights(path)
+
+
+MM = [[100, -1300, 250], [1270, 0, 508]]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "unit"),
+    [
+        ("a.csv", "id,x_mm,y_mm,z_mm\n7,100,-1300,250\n12,1270,0,508\n", 0.001),
+        ("a.csv", "x [mm];Y (mm);z mm;Light ID\n100;-1300;250,0;07\n1270;0;508;12\n", 0.001),
+        ("a.txt", "# id x_cm y_cm z_cm\n7.0 10 -130 25\n12.0 127 0 50.8\n", 0.01),
+        ("a.csv", "pos_x_m\tpos_y_m\tpos_z_m\tlight\n.1\t-1.3\t.25\t7\n1.27\t0\t.508\t12\n", 1.0),
+        ("a.csv", "z_in,y_in,x_in,id\n9.84251969,-51.1811024,3.93700787,7\n20,0,50,12\n", 0.0254),
+        ("a.csv", "\n# of Tuesday\nid,x,y,z,\n7,.1,-1.3,.25,\n\n12,1.27,0,.508,\n", None),
+        ("a.csv", "7,.1,-1.3,.25\n12,1.27,0,.508\n", None),
+        ("a.json", '[{"id": 7, "x_mm": 100, "y_mm": -1300, "z_mm": 250}, '
+                   '{"id": "12", "x_mm": 1270, "y_mm": 0, "z_mm": 508}]', 0.001),
+        ("a.json", '{"units": {"position": "mm"}, "lights": [{"id": 7, "position": '
+                   '[100, -1300, 250]}, {"id": 12, "position": [1270, 0, 508]}]}', 0.001),
+        ("a.json", '\ufeff{"07": {"position_cm": [10, -130, 25]}, '
+                   '"light_012": {"position_cm": [127, 0, 50.8]}}', 0.01),
+    ],
+)  # fmt: skip
+def test_columns_are_read_by_name_and_unit(tmp_path: Path, name: str, text: str, unit) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    found = read_lights(tmp_path / name)
+    assert [light.name for light in found.lights] == ["light_007", "light_012"]
+    assert found.metres == unit
+    metres = np.array([light.position for light in found.lights]) * (unit or 1)
+    np.testing.assert_allclose(metres, np.array(MM) / 1000, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("id,x_mm,y_mm,z_mm\n7,1,2\n", "line 2 has 3 columns, the header has id, x_mm"),
+        ("id,x_mm,y_cm,z_mm\n7,1,2,3\n", "expected one unit for x, y and z"),
+        ("id,x_mm,y_mm,z_mm,x_cm\n7,1,2,3,4\n", "give a position twice"),
+        ("id,x_km,y_km,z_km\n7,1,2,3\n", "line 1: expected a number, got 'x_km'; a header"),
+        ("id,x_mm,y_mm,z_mm\n\n7,1,2,one\n", "line 3: expected a number, got 'one'"),
+        ("id,x_mm,y_mm,z_mm\n7,1,2,3\n07,3,4,5\n", "two lights have the name 'light_007'"),
+    ],
+)
+def test_a_table_that_is_not_clear_is_refused_at_its_line(tmp_path, text: str, words: str) -> None:
+    (tmp_path / "lights.csv").write_text(text)
+    with pytest.raises(LightFileError, match=words):
+        read_lights(tmp_path / "lights.csv")
+
+
+def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("id,x,y,z,power,red,green,blue\n7,1,2,3,40,1,2,3\n")
+    found = read_lights(tmp_path / "a.csv")
+    assert found.lights[0].intensity.tolist() == [1, 2, 3]
+    assert "not used of its lights: power" in found.notes[0]

@@ -14,6 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pxr import Usd, UsdGeom
+from scipy import interpolate
+from scipy.spatial import cKDTree
 
 from reconstruction import StrandFileError, Strands, read_strands, write_strands
 from reconstruction.files import durable
@@ -473,9 +475,9 @@ def test_usd_of_an_animation_is_read_at_its_start(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "widths", "words"),
     [
-        ("cubic", "[0.02]", "only linear curves"),
+        ("cubic", "[0.02]", "cubic bezier curves of 2 to 2 points do not end"),
         ("linear", "[0.02, 0.03, 0.04]", "3 widths for 1 curves"),
-        ("linear", "[0.02, 0]", "1 of 2 widths are not above 0"),
+        ("linear", "[0.02, -1]", "widths must be 0 or more, got -1"),
     ],
 )
 def test_usd_that_cannot_be_read(kind: str, widths: str, words: str, tmp_path: Path) -> None:
@@ -531,3 +533,198 @@ def test_archives_of_any_size_are_read(tmp_path: Path) -> None:
         file.seek(24 * 12 * 1_000_000)
         np.savez(file, points=np.stack([points, points + 1]), offsets=np.array([0, 2]))
     np.testing.assert_array_equal(read_poses(tmp_path / "poses.npz")[1].points, points + 1)
+
+
+ARC = np.stack([0.03 * np.cos(np.linspace(0, 2, 10)), 0.03 * np.sin(np.linspace(0, 2, 10)),
+                np.linspace(0, 0.09, 10)], axis=1)  # fmt: skip
+
+
+def write_curves(path: Path, kind: str, basis: str, wrap: str, widths, interpolation: str) -> None:
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    curves = UsdGeom.BasisCurves.Define(stage, "/root/hair")
+    curves.CreateTypeAttr(kind)
+    curves.CreateBasisAttr(basis)
+    curves.CreateWrapAttr(wrap)
+    curves.CreateCurveVertexCountsAttr([10, 10])
+    curves.CreatePointsAttr(np.vstack([ARC, ARC + 0.1]).astype(np.float32))
+    if widths is not None:
+        curves.CreateWidthsAttr(np.asarray(widths, np.float32))
+        curves.SetWidthsInterpolation(interpolation)
+    stage.GetRootLayer().Export(str(path))
+
+
+def scipys_curve(basis: str, wrap: str):
+    """SciPy's curve through or by `ARC`, as a function of [0, 1]: knots by the basis."""
+    if basis == "bspline":
+        points = ARC
+        if wrap == "pinned":
+            points = np.vstack([2 * ARC[0] - ARC[1], ARC, 2 * ARC[-1] - ARC[-2]])
+        n = len(points)
+        spline = interpolate.BSpline(np.arange(n + 4) - 3.0, points, 3)
+        return lambda t: spline(t * (n - 3))
+    if basis == "bezier":
+        pieces = [interpolate.BPoly(ARC[3 * k : 3 * k + 4, None], [k, k + 1]) for k in range(3)]
+        return lambda t: np.array([pieces[min(int(3 * v), 2)](3 * v) for v in t])
+    points = np.vstack([2 * ARC[0] - ARC[1], ARC, 2 * ARC[-1] - ARC[-2]])
+    inner = points[1:-1] if wrap == "pinned" else ARC[1:-1]
+    slopes = (points[2:] - points[:-2]) / 2 if wrap == "pinned" else (ARC[2:] - ARC[:-2]) / 2
+    spline = interpolate.CubicHermiteSpline(np.arange(len(inner)), inner, slopes)
+    return lambda t: spline(t * (len(inner) - 1))
+
+
+@pytest.mark.parametrize("wrap", ["pinned", "nonperiodic"])
+@pytest.mark.parametrize("basis", ["catmullRom", "bspline", "bezier"])
+def test_cubic_curves_are_followed_from_end_to_end(basis: str, wrap: str, tmp_path: Path) -> None:
+    write_curves(tmp_path / "h.usda", "cubic", basis, wrap, [8e-5], "constant")
+    strands = read_strands(tmp_path / "h.usda")
+    assert len(strands) == 2
+    np.testing.assert_allclose(strands[1], strands[0] + 0.1, atol=1e-6)
+    truth = scipys_curve(basis, wrap)(np.linspace(0, 1, 4001))
+    np.testing.assert_allclose(strands[0][[0, -1]], truth[[0, -1]], atol=1e-7)
+    assert cKDTree(truth).query(strands[0])[0].max() < 2e-5
+    ours = Strands.from_list([strands[0]])
+    middle = interpolate.interp1d(np.cumsum(np.r_[0, np.linalg.norm(np.diff(ours.points, axis=0),
+                                  axis=1)]), ours.points, axis=0)  # fmt: skip
+    dense = middle(np.linspace(0, ours.lengths()[0] * 0.999999, 4001))
+    assert cKDTree(dense).query(truth)[0].max() < 3e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrap", "widths", "interpolation", "root", "tip"),
+    [
+        ("linear", "nonperiodic", [*range(9, -1, -1)] * 2, "vertex", 4.5, 1e-6),
+        ("cubic", "pinned", [*range(9, -1, -1)] * 2, "vertex", 4.5, 1e-6),
+        ("cubic", "nonperiodic", [*range(7, -1, -1)] * 2, "varying", 3.5, 1e-6),
+        ("cubic", "pinned", [3, 5], "uniform", 1.5, 1.5),
+        ("cubic", "pinned", [3], "vertex", 1.5, 1.5),  # the interpolation's default: it is one
+        ("linear", "nonperiodic", [0] * 20, "vertex", 4e-5, 4e-5),
+        ("linear", "nonperiodic", None, "", 4e-5, 4e-5),
+    ],
+)
+def test_widths_of_usd(kind, wrap, widths, interpolation, root, tip, tmp_path: Path) -> None:
+    write_curves(tmp_path / "h.usda", kind, "catmullRom", wrap, widths, interpolation)
+    strands = read_strands(tmp_path / "h.usda")
+    radius = np.broadcast_to(strands.radius, len(strands.points))
+    np.testing.assert_allclose(radius[[0, strands.offsets[1] - 1]], [root, tip], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("basis", "wrap", "widths", "words"),
+    [
+        ("bspline", "periodic", [1], "closed"),
+        ("bspline", "pinned", [1, 2, 3], "3 widths for 2 curves"),
+        ("bspline", "pinned", [-1], "widths must be 0 or more, got -1"),
+    ],
+)
+def test_curves_of_usd_that_are_not_clear_are_refused(basis, wrap, widths, words, tmp_path) -> None:
+    write_curves(tmp_path / "h.usda", "cubic", basis, wrap, widths, "vertex")
+    with pytest.raises(StrandFileError, match=words):
+        read_strands(tmp_path / "h.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "h.usda"))
+    stage.GetPrimAtPath("/root/hair").GetAttribute("wrap").Set("pinned")
+    stage.GetPrimAtPath("/root/hair").GetAttribute("widths").Set([1.0])
+    UsdGeom.NurbsCurves.Define(stage, "/root/more")
+    stage.GetRootLayer().Save()
+    with pytest.raises(StrandFileError, match="/root/more: NurbsCurves are not read"):
+        read_strands(tmp_path / "h.usda")
+
+
+def test_a_thickness_of_0_is_a_tip(tmp_path: Path) -> None:
+    path = tmp_path / "x.hair"
+    xyz = np.arange(18, dtype="<f4").tobytes()
+    path.write_bytes(hair_bytes(flags=6, body=xyz + np.array([4, 2, 0, 4, 2, 0], "<f4").tobytes()))
+    np.testing.assert_allclose(read_strands(path).radius, [2, 1, 1e-6, 2, 1, 1e-6])
+    path.write_bytes(hair_bytes(flags=6, body=xyz + np.array([4, 2, -1] * 2, "<f4").tobytes()))
+    with pytest.raises(StrandFileError, match="the width of point 2 is -1"):
+        read_strands(path)
+
+
+@pytest.mark.parametrize("less", [0, 1])
+def test_hair_without_a_header(less: int, tmp_path: Path) -> None:
+    """Points or segments (one less) for each strand; told by the file's size."""
+    path, counts = tmp_path / "x.hair", np.array([3, 2, 4])
+    xyz = np.random.default_rng(0).normal(size=(9, 3)).astype("<f4")
+    raw = struct.pack("<2I", 3, 9) + (counts - less).astype("<u2").tobytes() + xyz.tobytes()
+    path.write_bytes(raw)
+    strands = read_strands(path)
+    assert strands.offsets.tolist() == [0, 3, 5, 9]
+    np.testing.assert_array_equal(strands.points, xyz)
+    for bad in (raw[:-1], raw + b"x", raw[:8] + b"\x09" + raw[9:]):
+        path.write_bytes(bad)
+        with pytest.raises(StrandFileError, match=r"not a \.hair file|truncated"):
+            read_strands(path)
+
+
+def write_ply(path: Path, points: np.ndarray, columns: dict[str, np.ndarray], form: str,
+              edges: np.ndarray | None = None) -> None:  # fmt: skip
+    head = f"ply\nformat {form} 1.0\nelement vertex {len(points)}\n"
+    head += "".join(f"property float {n}\n" for n in "xyz")
+    head += "".join(f"property uchar {n}\n" for n in columns)
+    order = ">" if "big" in form else "<"
+    fields = [("p", order + "f4", 3), *((n, "u1") for n in columns)]
+    rows = np.zeros(len(points), fields)
+    rows["p"] = points
+    for name, values in columns.items():
+        rows[name] = values
+    if edges is not None:
+        head += f"element edge {len(edges)}\nproperty int vertex1\nproperty int vertex2\n"
+    if form == "ascii":
+        body = "".join(" ".join(map(str, [*r[0], *list(r)[1:]])) + "\n" for r in rows).encode()
+        body += (
+            "".join(f"{a} {b}\n" for a, b in edges if True).encode() if edges is not None else b""
+        )
+    else:
+        body = rows.tobytes() + (b"" if edges is None else edges.astype(order + "i4").tobytes())
+    path.write_bytes(f"{head}end_header\n".encode() + body)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("how", ["colours", "twins", "gaps", "numbers", "edges"])
+def test_strands_of_a_ply(form: str, how: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    roots = 0.08 * rng.normal(size=(12, 1, 3))
+    length = rng.uniform(0.02, 0.3, (12, 1, 1))
+    points = roots + length * np.linspace(0, 1, 25)[:, None] * (0, 0, 1)
+    points += 0.01 * np.sin(20 * points[..., :1])
+    points, counts = points.reshape(-1, 3).astype(np.float32), np.full(12, 25)
+    columns, edges = {}, None
+    if how in ("colours", "twins"):
+        colour = rng.integers(0, 255, (12, 3))
+        if how == "twins":  # two neighbours of one colour
+            colour[4] = colour[5]
+        columns = dict(zip(("red", "green", "blue"), np.repeat(colour, 25, 0).T, strict=True))
+    elif how != "gaps":
+        counts = np.array([25, 50, 20, 5, *[25] * 8])
+        number = np.repeat(np.arange(12), counts)
+        columns = {"strand_id": number} if how == "numbers" else {}
+        first = np.flatnonzero(number[1:] == number[:-1])
+        edges = np.stack([first, first + 1], axis=1) if how == "edges" else None
+    write_ply(tmp_path / "s.ply", points, columns, form, edges)
+    strands = read_strands(tmp_path / "s.ply")
+    assert np.diff(strands.offsets).tolist() == counts.tolist()
+    np.testing.assert_allclose(strands.points, points, rtol=1e-6)
+
+
+def test_a_ply_whose_strands_are_unknown_is_refused(tmp_path: Path) -> None:
+    cloud = np.random.default_rng(0).normal(size=(300, 3))
+    write_ply(tmp_path / "s.ply", cloud, {}, "ascii")
+    with pytest.raises(StrandFileError, match="the strands' ends are unknown"):
+        read_strands(tmp_path / "s.ply")
+
+
+def test_long_strands_are_resampled_by_arc_length() -> None:
+    """A circle of 400 uneven points: 255 lie on it, evenly, ends kept, width with the angle."""
+    angle = 1.5 * np.linspace(0, 1, 400) ** 2
+    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    short = np.array([[0.0, 0, 0], [1, 1, 1]])
+    radius = np.r_[1 + angle, 1, 1].astype(np.float32)
+    few = Strands(np.vstack([circle, short]), np.array([0, 400, 402]), radius).at_most(255)
+    assert few.offsets.tolist() == [0, 255, 257]
+    even = np.linspace(0, 1.5, 255)
+    expected = np.stack([np.cos(even), np.sin(even), 0 * even], axis=1)
+    np.testing.assert_allclose(few[0], expected, atol=2e-5)
+    np.testing.assert_allclose(few.radius[:255], 1 + even, atol=1e-4)
+    np.testing.assert_array_equal(few[1], short)
+    assert few.at_most(255) is few
