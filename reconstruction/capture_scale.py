@@ -66,6 +66,14 @@ class CaptureScale:
             length(options.grid, _GRID),
         )
 
+    @property
+    def resolution(self) -> str:
+        """What the pixels separate, as a sentence without its full stop."""
+        return (
+            f"pixels of {1e3 * self.pixel:.2g} mm: hairs closer than "
+            f"{1e3 * RESOLVED * self.pixel:.2g} mm cannot be separated"
+        )
+
     def figures(self) -> dict[str, Any]:
         """Millimetres, JSON-ready, and the distance of lines that images resolve."""
         names = ("pixel", "thin", "tolerance", "margin", "grid")

@@ -71,13 +71,14 @@ class StageCost:
 @dataclass(frozen=True)
 class Estimate:
     """Cost of a reconstruction: `stages` in order, `frames` read, `disk_gb` written, `working_gb`
-    of temporary files."""
+    of temporary files; `scale` is what it resolves, for a head at the origin."""
 
     method: Method
     stages: tuple[StageCost, ...]
     frames: int
     disk_gb: float
     working_gb: float
+    scale: CaptureScale
 
     @property
     def seconds(self) -> float:
@@ -110,7 +111,7 @@ def estimate(
     frames = sum(capture.has(s, c.name) for s in capture.steps for c in capture.rig.cameras)
     each = 1e-6 if capture.of_kind("scanline") else 3.6e-6
     disk_gb, working_gb = 0.01 + each * probe.points, cache_bytes(capture) / GB
-    return Estimate(method, tuple(stages), frames, disk_gb, working_gb)
+    return Estimate(method, tuple(stages), frames, disk_gb, working_gb, probe.scale)
 
 
 @dataclass(frozen=True, eq=False)

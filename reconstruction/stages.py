@@ -10,7 +10,7 @@ from typing import Literal, TypeVar
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture
-from reconstruction.capture_scale import RESOLVED, CaptureScale
+from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.hair_envelope import build_envelope
@@ -161,11 +161,7 @@ class MeasuringStages(Stages):
                 at = masked.subject_hull(_COARSE).centers()
             scale = CaptureScale.of(masked.cameras, at, self.options)
             stage.figures.update(scale.figures())
-            self.progress(
-                f"pixels of {1e3 * scale.pixel:.2g} mm: hairs closer than "
-                f"{1e3 * RESOLVED * scale.pixel:.2g} mm cannot be separated",
-                0.0,
-            )
+            self.progress(scale.resolution, 0.0)
         return scale
 
     def envelope(

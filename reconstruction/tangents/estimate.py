@@ -28,7 +28,7 @@ from reconstruction.tangents.line_evidence import (
     line_support,
     visible_from,
 )
-from reconstruction.tangents.pooling import NEIGHBOURS, agreement, chosen, pool
+from reconstruction.tangents.pooling import NEIGHBOURS, agreement, chosen, pool, radii
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
     OlatStack,
@@ -141,9 +141,10 @@ class Views:
     def bank(self, spacing: float, candidates: Array, progress: Progress) -> LogGaborBank:
         """Filters of the wavelength in whose texture half of the cameras predicts the other best.
 
-        The directions that one half scores highest are looked up, as in `pooling.chosen`, in the
-        other half's scores at the shortest wavelength, which blur least. Only some points and
-        lights are used. Ties and flat images go to the shortest.
+        The directions that one half scores highest, averaged in the radius that suits the
+        wavelength, are looked up, as in `pooling.chosen`, in the other half's scores at the
+        shortest wavelength, which blur least. Only some points and lights are used. Ties and flat
+        images go to the shortest.
         """
         rows = np.linspace(0, len(self.points) - 1, PATCHES).astype(np.int64)
         near = cKDTree(self.points).query(self.points[rows], k=min(PATCH, len(self.points)))[1]
@@ -162,8 +163,11 @@ class Views:
                 support = line_support(responses(replace(BANK, wavelength=wavelength), details))
                 evidence = LineEvidence.of(camera, support, points, visible[:, k])
                 scores[k % 2, evidence.index] += line_scores(evidence, candidates)
-        table = pool(points, 4 * spacing, NEIGHBOURS)
-        found = [agreement((table @ h[0], table @ h[1]), halves[0]) for h in halves]
+        tables = [pool(points, radius, NEIGHBOURS) for radius in radii(spacing)[::2]]
+        found = [
+            max(agreement((table @ h[0], table @ h[1]), halves[0]) for table in tables)
+            for h in halves
+        ]
         return replace(BANK, wavelength=WAVELENGTHS[int(np.argmax(found))])
 
 

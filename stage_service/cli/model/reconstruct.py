@@ -137,6 +137,8 @@ def _estimate(capture: Capture, options: JobOptions, output: Output) -> None:
         f"{machine_gb:.0f}; {found.frames:,} frames are read, the model takes {found.disk_gb:.1f} "
         f"GB of disk{temporary}. Estimates are usually within a third on an idle machine."
     )
+    resolution = found.scale.resolution
+    lines.append(f"{resolution[0].upper()}{resolution[1:]}.")
     data = {"reduced": by, "method": found.method, **asdict(found), "seconds": found.seconds}
     if found.peak_gb > MEMORY_SHARE * machine_gb:
         for by in (n for n in (2, 4, 8, 16) if n > options.reduced):

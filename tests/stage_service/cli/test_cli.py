@@ -326,7 +326,10 @@ def test_reconstruct_reports_its_cost(capsys, tmp_path):
     assert data["peak_gb"] == max(s["peak_gb"] for s in data["stages"])
     assert data["working_gb"] == pytest.approx(4 * 20 * 15 * 13e-9)
     assert main(["reconstruct", str(tmp_path / "c"), "--estimate"]) == 0
-    assert "orientation" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "orientation" in shown
+    # 2 x 1.02 m x tan(10 degrees) / 40 pixels
+    assert "Pixels of 9 mm: hairs closer than 18 mm cannot be separated." in shown
     assert sorted(tmp_path.rglob("*")) == before
     code, data = run(capsys, "reconstruct", tmp_path / "c", "--estimate", "--reduce", "31")
     assert code == 3
