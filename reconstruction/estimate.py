@@ -328,7 +328,7 @@ class _Probe:
         measured = self.frames("olat") * self.again + groups * (1 + choice) * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
-        images = self.pixels * (5 * lights + 4 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
+        images = self.pixels * (5 * lights + 8 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
         scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
         part = 0.35e9 * min(n / 2e4, 1.0)  # of scores being decided

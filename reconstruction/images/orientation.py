@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -121,13 +121,35 @@ def texture(image: AnyFloats, mask: Bools, scale: float = 4.0) -> Floats:
     The mean is Gaussian with `scale` pixels. Detail is 0 outside the mask and in the dark, so that
     outline and shading give no response.
     """
+    return _detail_and_mean(image, mask, scale)[0]
+
+
+def textures(images: Sequence[AnyFloats], masks: Sequence[Bools], scale: float = 4.0) -> Floats:
+    """The `texture` of each image `(N, H, W)`, weighted by the root of its local mean.
+
+    Photon noise is the root of the light, so that it is as strong in all of them; without weights
+    that of dark images prevails. The weights of a pixel have mean 1.
+    """
+    out = np.empty((len(images), *masks[0].shape), np.float32)
+    weights = np.empty_like(out)
+    for k, (image, mask) in enumerate(zip(images, masks, strict=True)):
+        out[k], mean = _detail_and_mean(image, mask, scale)
+        np.sqrt(mean, out=weights[k])
+    out *= weights
+    out /= weights.mean(axis=0) + np.float32(1e-30)
+    return out
+
+
+def _detail_and_mean(image: AnyFloats, mask: Bools, scale: float) -> tuple[Floats, Floats]:
+    """The texture of an image and its local mean, 0 where there is no texture."""
     inside = mask.astype(np.float32)
     weight = ndimage.gaussian_filter(inside, scale)
     mean = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), scale)
     floor = 1e-6 * float(np.abs(image[mask]).max(initial=0.0)) + 1e-30
     ratio = image * weight / np.maximum(mean, floor) - 1
     lit = mask & (mean > floor)
-    return np.where(lit, np.clip(ratio, -1.0, 3.0), 0.0).astype(np.float32)
+    detail = np.where(lit, np.clip(ratio, -1.0, 3.0), 0.0).astype(np.float32)
+    return detail, np.where(lit, mean / np.maximum(weight, 1e-30), 0.0).astype(np.float32)
 
 
 def orientations(

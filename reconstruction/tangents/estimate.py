@@ -15,7 +15,7 @@ from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
-from reconstruction.images.orientation import responses, texture
+from reconstruction.images.orientation import responses, textures
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
@@ -273,12 +273,12 @@ def _details(stack: OlatStack, mask: Bools, group: Ints, scale: float) -> Floats
 
     The local mean has `scale` pixels.
     """
-    details = [
-        texture(stack.olat[of].sum(axis=0), mask & whole, scale)
-        for g in np.unique(group)
-        if (of := (group == g) & stack.shot).any() and (whole := stack.known[of].all(axis=0)).any()
-    ]
-    return np.stack(details or [np.zeros(mask.shape, np.float32)])
+    groups = [(group == g) & stack.shot for g in np.unique(group)]
+    known = [mask & stack.known[of].all(axis=0) for of in groups]
+    shown = [(of, m) for of, m in zip(groups, known, strict=True) if of.any() and m.any()]
+    if not shown:
+        return np.zeros((1, *mask.shape), np.float32)
+    return textures([stack.olat[of].sum(axis=0) for of, _ in shown], [m for _, m in shown], scale)
 
 
 def _visible(

@@ -16,11 +16,19 @@ from benchmarks.pictures import picture_strands
 from benchmarks.pixels.rig import PITCHES, SUBJECTS, TUNING, patch_capture
 from benchmarks.results import save
 from benchmarks.strand_truth import Ball, StrandTruth, write_hair_masks
-from reconstruction import Capture, Model, Progress, ReconstructOptions, reconstruct
+from reconstruction import (
+    Capture,
+    CaptureError,
+    Model,
+    Progress,
+    ReconstructOptions,
+    reconstruct,
+)
 from reconstruction.methods import Method
 
 METHODS: tuple[Method, ...] = ("light_planes", "hull")
 AT = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
+TANGENTS = ("wavelength_px", "texture_radius_mm", "radius_mm", "reflection_weight")
 SAMPLES = 20_000
 HEADER = (
     "| subject | pixel mm | | F at 1 / 2 / 3 mm | precision | recall | F at equal length "
@@ -67,7 +75,13 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
         model = Model(out / method)
         begin = time.perf_counter(), time.process_time()
         part = within(progress, method, 0.6 + 0.3 * k / len(args.methods), 0.3 / len(args.methods))
-        report = reconstruct(Capture(folder), model, method=method, options=options, progress=part)
+        try:
+            report = reconstruct(
+                Capture(folder), model, method=method, options=options, progress=part
+            )
+        except CaptureError as error:
+            variants[method] = {"left_out": str(error)}
+            continue
         variants[method] = {
             **truth.score(model.strands()),
             "seconds": time.perf_counter() - begin[0],
@@ -75,12 +89,13 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
             "peak_gb": max(s.peak_gb or 0.0 for s in report.stages),
             "stages": {s.name: s.seconds for s in report.stages},
             "scale": report["scale"].figures,
-            "tangents": {
-                k: report["orientation"].figures.get(k) for k in ("radius_mm", "reflection_weight")
-            },
+            "tangents": {k: report["orientation"].figures.get(k) for k in TANGENTS},
         }
+    done = [m for m in args.methods if "left_out" not in variants[m]]
+    if not done:
+        return variants
     progress("baselines", 0.95)
-    model = Model(out / args.methods[0])
+    model = Model(out / done[0])
     variants |= truth.baselines(model)
     _picture(out, capture, truth, model, ball)
     return variants
@@ -94,14 +109,14 @@ def _picture(out: Path, capture: Capture, truth: StrandTruth, model: Model, ball
 def table(results: dict[str, Any]) -> str:
     """The cells as a table in Markdown; the visible strands are scored."""
     rows = [HEADER, "|" + " --- |" * 10]
-    for label, variants in results["cells"].items():
+    for label, found in results["cells"].items():
         name, pitch = label.removesuffix("um").rsplit("_", 1)
-        if "left_out" in variants:
-            rows.append(
-                f"| {name} | {int(pitch) / 1e3:g} | left out: {variants['left_out']} |" + " |" * 7
-            )
-            continue
+        variants = {"": found} if "left_out" in found else found
         for variant, score in variants.items():
+            if "left_out" in score:
+                cells = [name, f"{int(pitch) / 1e3:g}", variant.replace("_", " ")]
+                rows.append(f"| {' | '.join(cells)} | left out: {score['left_out']} |" + " |" * 6)
+                continue
             visible, equal = score["visible"], score["equal_length"]["visible"]
             lengths = score["lengths"]
             first = visible[AT[0]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reconstruction.images.orientation import orientations, responses, texture
+from reconstruction.images.orientation import orientations, responses, texture, textures
 from reconstruction.reconstruct_options import LogGaborBank
 
 SMALL = LogGaborBank(count=32, spread=2.0)
@@ -99,6 +99,28 @@ def test_texture_does_not_depend_on_exposure() -> None:
     mask = np.ones((48, 48), bool)
     image = grating(0.7, 48)
     np.testing.assert_allclose(texture(1e-3 * image, mask), texture(image, mask), atol=1e-5)
+
+
+@pytest.mark.parametrize("photons", [100.0, 1e4], ids=["noise", "little noise"])
+def test_lines_are_found_beside_many_dark_pictures(photons: float) -> None:
+    """One picture is lit; twenty have a hundredth of its light, photon noise and read noise."""
+    rng, mask = np.random.default_rng(0), np.ones((64, 64), bool)
+    light = photons * (1 + 0.4 * (grating(0.7, wavelength=6.0) - 1))
+    pictures = [rng.poisson(p) + rng.normal(size=p.shape) for p in [light, *[1e-2 * light] * 20]]
+    bank = LogGaborBank(wavelength=6.0, count=24, spread=1.5)
+    found = responses(bank, textures(pictures, [mask] * 21)).argmax(axis=0) * np.pi / 24
+    off = difference(found, 0.7)[8:-8, 8:-8]
+    assert (off < 10).mean() > 0.9  # unweighted .48 with noise
+
+
+def test_pictures_of_one_brightness_weigh_alike() -> None:
+    mask = np.ones((48, 48), bool)
+    pictures = [grating(0.7, 48), 1e3 * grating(0.7, 48)]
+    same = textures([pictures[0]] * 3, [mask] * 3)
+    np.testing.assert_allclose(same, np.stack([texture(pictures[0], mask)] * 3), rtol=1e-5)
+    bright = textures(pictures, [mask] * 2)
+    np.testing.assert_allclose(bright.mean(axis=0), texture(pictures[0], mask), atol=1e-5)
+    assert not textures([np.zeros((48, 48))] * 2, [mask] * 2).any()
 
 
 def test_wrong_shapes_and_banks_are_refused() -> None:
