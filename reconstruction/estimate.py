@@ -32,13 +32,7 @@ from reconstruction.pipeline import FINE_PIXEL, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent
 from reconstruction.stages import method_for
-from reconstruction.tangents.estimate import (
-    BANK,
-    CANDIDATES,
-    LIGHT_GROUPS,
-    WAVELENGTH_GROUPS,
-    WAVELENGTHS,
-)
+from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
 
 KNOWN_TASK = 0.0155
@@ -321,11 +315,9 @@ class _Probe:
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
-        lights, n, bank = self.lights, self.points, self.options.measure.bank or BANK
-        chosen = self.options.measure.bank is None
+        lights, n, bank = self.lights, self.points, self.options.measure.bank
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        choice = len(WAVELENGTHS) * WAVELENGTH_GROUPS / LIGHT_GROUPS if chosen else 0.0
-        measured = self.frames("olat") * self.again + groups * (1 + choice) * self.filtering(bank)
+        measured = self.frames("olat") * self.again + groups * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
         images = self.pixels * (5 * lights + 8 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)

@@ -38,18 +38,16 @@ class MotionOptions:
 class MeasureOptions:
     """How tangents are measured; lengths in metres, None: derived from the capture.
 
-    The filter `bank` is applied to images under groups of neighbouring lights (None: 24 filters of
-    the wavelength of 4 to 12 pixels by which half of the cameras predicts the other half best);
-    `texture_scale` in pixels is that of their local mean (None: 0.65 wavelengths). Points closer
-    than `thin` are merged first (None: 1.25 pixels). Points up to `tolerance` behind a camera's
-    depth are visible in it (None: 5/3 pixels). Scores of a point's directions are averaged over up
-    to `neighbours` within `radius`; those of reflections under single lights count
-    `reflection_weight` times those of the texture. None: the radius and weight by which half of
-    the cameras predicts the other half best.
+    The filter `bank` is applied to images under groups of neighbouring lights; `texture_scale` in
+    pixels is that of their local mean. Points closer than `thin` are merged first (None: 1.25
+    pixels). Points up to `tolerance` behind a camera's depth are visible in it (None: 5/3 pixels).
+    Scores of a point's directions are averaged over up to `neighbours` within `radius`; those of
+    reflections under single lights count `reflection_weight` times those of the texture. None: the
+    radius and weight by which half of the cameras predicts the other half best.
     """
 
-    bank: LogGaborBank | None = None
-    texture_scale: Length | None = None
+    bank: LogGaborBank = LogGaborBank(wavelength=4.0, count=24, spread=1.5)
+    texture_scale: Length = 2.6
     radius: Length | None = None
     neighbours: Count = 96
     thin: Length | None = None

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.capture.folder import Capture
@@ -17,7 +16,7 @@ from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, textures
 from reconstruction.masks import MaskedCapture
-from reconstruction.reconstruct_options import LogGaborBank, MeasureOptions
+from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
@@ -28,7 +27,7 @@ from reconstruction.tangents.line_evidence import (
     line_support,
     visible_from,
 )
-from reconstruction.tangents.pooling import NEIGHBOURS, agreement, chosen, pool, radii
+from reconstruction.tangents.pooling import chosen, pool
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
     OlatStack,
@@ -41,13 +40,6 @@ CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
 TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
 ROUNDS = 2  # of the reflection table, filled from the directions of the round before
-BANK = LogGaborBank(wavelength=4.0, count=24, spread=1.5)
-"""Its wavelength is the shortest, whose scores are the yardstick for longer ones."""
-WAVELENGTHS = (4.0, 6.0, 8.0, 12.0)
-TEXTURE_SCALE = 0.65
-"""Wavelengths of the filters in the local mean's deviation."""
-WAVELENGTH_GROUPS, PATCHES, PATCH = 4, 40, 150
-"""Groups of lights by which wavelengths are compared, at so many patches of so many points."""
 LIGHT_GROUPS = 24  # groups of neighbouring lights, each with a texture of its own
 
 
@@ -124,53 +116,6 @@ class Saturation:
             )
 
 
-@dataclass(frozen=True)
-class Views:
-    """What `visible (N, C)` cameras show of `points (N, 3)` under lights by `names`.
-
-    `group (L,)` numbers the group of each light.
-    """
-
-    masked: MaskedCapture
-    cameras: Sequence[Camera]
-    names: Sequence[str]
-    group: Ints
-    points: Array
-    visible: Bools
-
-    def bank(self, spacing: float, candidates: Array, progress: Progress) -> LogGaborBank:
-        """Filters of the wavelength in whose texture half of the cameras predicts the other best.
-
-        The directions that one half scores highest, averaged in the radius that suits the
-        wavelength, are looked up, as in `pooling.chosen`, in the other half's scores at the
-        shortest wavelength, which blur least. Only some points and lights are used. Ties and flat
-        images go to the shortest.
-        """
-        rows = np.linspace(0, len(self.points) - 1, PATCHES).astype(np.int64)
-        near = cKDTree(self.points).query(self.points[rows], k=min(PATCH, len(self.points)))[1]
-        some = np.unique(near)
-        points, visible = self.points[some], self.visible[some]
-        groups = np.linspace(0, self.group.max(), WAVELENGTH_GROUPS).astype(np.int64)
-        few = np.flatnonzero(np.isin(self.group, groups))
-        names = [self.names[int(i)] for i in few]
-        halves = np.zeros((len(WAVELENGTHS), 2, len(some), len(candidates)), np.float32)
-        for k, camera in enumerate(self.cameras):
-            progress("line width", 0.0)
-            mask = self.masked.masks[camera.name].hair
-            stack = read_olat(self.masked.capture, camera, names)
-            for scores, wavelength in zip(halves, WAVELENGTHS, strict=True):
-                details = _details(stack, mask, self.group[few], TEXTURE_SCALE * wavelength)
-                support = line_support(responses(replace(BANK, wavelength=wavelength), details))
-                evidence = LineEvidence.of(camera, support, points, visible[:, k])
-                scores[k % 2, evidence.index] += line_scores(evidence, candidates)
-        tables = [pool(points, radius, NEIGHBOURS) for radius in radii(spacing)[::2]]
-        found = [
-            max(agreement((table @ h[0], table @ h[1]), halves[0]) for table in tables)
-            for h in halves
-        ]
-        return replace(BANK, wavelength=WAVELENGTHS[int(np.argmax(found))])
-
-
 def measure_tangents(
     masked: MaskedCapture,
     points: Array,
@@ -203,10 +148,6 @@ def measure_tangents(
     reads = len(lights) >= FEWEST_LIGHTS
     normals = _normals(points, cameras, visible) if reads else None
     candidates = half_sphere(CANDIDATES)
-    views = Views(masked, cameras, names, group, points, visible)
-    bank = options.bank or views.bank(scale.thin, candidates, progress)
-    texture_scale = options.texture_scale or TEXTURE_SCALE * bank.wavelength
-    stage.figures["wavelength_px"] = bank.wavelength
     halves = np.zeros((2, len(points), CANDIDATES), np.float32)  # by every other camera
     evidences, observations, saturation = [], [], Saturation()
     for k, camera in enumerate(cameras):  # the frames of one camera at a time bound memory
@@ -214,8 +155,8 @@ def measure_tangents(
         mask = masked.masks[camera.name].hair
         stack = read_olat(capture, camera, names)
         saturation.add(stack, mask)
-        details = _details(stack, mask, group, texture_scale)
-        support = line_support(responses(bank, details))
+        details = _details(stack, mask, group, options.texture_scale)
+        support = line_support(responses(options.bank, details))
         evidences.append(LineEvidence.of(camera, support, points, visible[:, k]))
         halves[k % 2, evidences[-1].index] += line_scores(evidences[-1], candidates)
         if normals is not None:

@@ -27,11 +27,6 @@ NEIGHBOURS = 96
 _SAMPLE = 3000  # points at which choices are compared
 
 
-def radii(spacing: float) -> list[float]:
-    """The radii that are compared, metres, for points `spacing` metres apart."""
-    return [r * spacing for r in RADII if r * spacing <= MOST_RADIUS] or [MOST_RADIUS]
-
-
 def pool(
     points: AnyFloats, radius: float, most: int = 24, rows: Ints | None = None
 ) -> sparse.csr_array:
@@ -93,11 +88,12 @@ def chosen(
             0.0,
         )
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64))
+    radii = [r * spacing for r in RADII if r * spacing <= MOST_RADIUS] or [MOST_RADIUS]
     weights = WEIGHTS if weight is None else (weight,)
     kinds = [texture] if reflection is None else [texture, reflection]
     own = [kind[:, rows] for kind in kinds]
     best = Pooling(0.0, 0.0, -np.inf)
-    for r in radii(spacing) if radius is None else [radius]:
+    for r in radii if radius is None else [radius]:
         near = pool(points, r, NEIGHBOURS, rows)
         pooled = [[near @ half for half in kind] for kind in kinds]
         for w in weights if reflection is not None else (0.0,):

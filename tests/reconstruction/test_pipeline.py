@@ -161,7 +161,7 @@ def test_the_progress_of_all_stages_goes_from_nothing_to_all_once(
 
 
 def test_strands_run_down_from_the_scalp(model: tuple[Path, Report]) -> None:
-    runs_down(read_strands(model[0] / "strands.npz"))
+    runs_down(read_strands(model[0] / "strands.npz"), within_deg=5, mostly=0.75)
 
 
 @pytest.mark.slow
