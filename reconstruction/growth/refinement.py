@@ -8,10 +8,7 @@ cameras could not have measured them.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,66 +16,21 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
-from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands, unit_or_zero
+from reconstruction.growth.lines import GUESSED, REACH, Lines, Surfaces
+from reconstruction.growth.selection import select_by_coverage, without_exposed_ends
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
-from reconstruction.tangents.line_evidence import half_sphere, visible_from
 
-WIDTH = 1e-3
-"""Metres: the standard deviation of a line's support across itself, where lines are not denser."""
-WIDTHS_APART = 0.8  # the same in distances between measured lines, where they are
-
-# Lengths in widths: within which lines support a point; a line's deviation across itself; behind
-# the visible surface where hair is occluded, and the deviation of that; the largest step.
-REACH, POINT_DEVIATION, BEHIND, BEHIND_DEVIATION, _LARGEST_STEP = 4.0, 0.5, 1.0, 1.0, 2.0
-
-ALIKE_DEG = 10.0  # standard deviation of a line's support
-GUESS = 0.05  # coverage of a cell without measurement; 1 with the best
-HEADINGS = 24  # directions of a coverage cell
+# Lengths in widths: a line's deviation across itself; behind the visible surface where hair is
+# occluded, and the deviation of that; the largest step.
+POINT_DEVIATION, BEHIND, BEHIND_DEVIATION, _LARGEST_STEP = 0.5, 1.0, 1.0, 2.0
 
 ANGLE_DEVIATION = np.radians(30.0)
 """Of a measured line of confidence 1: twice its error, as neighbouring lines' errors correlate."""
 BEND_DEVIATION = 0.2  # per point, of the change of the turn from one point to the next
 GUESS_DEVIATION = 3e-3  # metres, of the displacement of an unsupported point
 COMPATIBLE = np.cos(np.radians(35.0))
-GUESSED = 0.05  # support up to which a point is guessed
-
-_NEIGHBOURS = 6
-
-
-class Lines:
-    """Measured lines, looked up by place and direction; `width` in metres (see `WIDTH`)."""
-
-    def __init__(self, lines: Measured, apart: float = np.inf) -> None:
-        """`apart` is the distance between neighbouring lines, metres."""
-        self.lines = lines
-        self.width = min(WIDTH, WIDTHS_APART * apart)
-        self._tree = cKDTree(lines.points, balanced_tree=False, compact_nodes=False)
-
-    def near(self, points: AnyFloats) -> tuple[Array, Ints, Bools]:
-        """Distances, numbers and whether there is one, each `(N, K)`, of lines within `REACH`."""
-        k = np.arange(1, min(_NEIGHBOURS, len(self.lines.points)) + 1)
-        reach = REACH * self.width
-        distance, index = self._tree.query(points, k=k, distance_upper_bound=reach, workers=-1)
-        found = np.isfinite(distance)
-        return np.where(found, distance, 0.0), np.where(found, index, 0), found
-
-    def support(self, points: AnyFloats, tangents: AnyFloats) -> Array:
-        """How well a measured line agrees with each point `(N, 3)` and its tangent `(N, 3)`.
-
-        `(N,)` in [0, 1]: the largest confidence, attenuated by distance and angle; 0 without a line
-        within `REACH`.
-        """
-        distance, index, found = self.near(points)
-        cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents))
-        turn = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
-        alike = np.exp(-0.5 * (distance / self.width) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
-        return np.asarray(np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1))
-
-
-Surfaces = Sequence[tuple[Camera, Array]]
-"""Cameras, each with the depth `(H, W)` of its hair's pixels, 0 elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,89 +121,6 @@ def supported(strands: Strands, measured: Measured, apart: float = np.inf) -> Fl
         return np.zeros(len(strands.points), np.float32)
     support = Lines(measured, apart).support(strands.points, strands.tangents())
     return support.clip(0, 1).astype(np.float32)
-
-
-def without_exposed_ends(strands: Strands, lines: Lines, surfaces: Surfaces) -> Strands:
-    """Strands that end where no line supports them any more although cameras see them.
-
-    A strand without any supported point stays as it is.
-    """
-    if not surfaces:
-        return strands
-    support = lines.support(strands.points, strands.tangents())
-    count = np.diff(strands.offsets)
-    place = np.arange(len(support)) - np.repeat(strands.offsets[:-1], count)
-    ends = (support < GUESSED) & exposed(strands.points, surfaces, lines.width)
-    last = np.maximum.reduceat(np.where(ends, -1, place), strands.offsets[:-1])
-    last = np.where(last < 1, count - 1, last)  # a strand has two points
-    keep = place <= np.repeat(last, count)
-    offsets = np.append(0, np.cumsum(last + 1))
-    radius = strands.radius[keep] if isinstance(strands.radius, np.ndarray) else strands.radius
-    return Strands(strands.points[keep], offsets, radius)
-
-
-def exposed(points: AnyFloats, surfaces: Surfaces, width: float) -> Bools:
-    """Whether some camera sees each of `points (N, 3)`: at most `width` behind its surface."""
-    out = np.zeros(len(points), bool)
-    for camera, surface in surfaces:
-        out |= visible_from(camera, surface, points, width)
-    return out
-
-
-def select_by_coverage(
-    strands: Strands, lines: Lines, marginal_coverage: float, surfaces: Surfaces = ()
-) -> Bools:
-    """Which strands `(S,)` add at least `marginal_coverage` per width of the lines.
-
-    A cell of a width and some 15 degrees is covered by the support of the best strand in it, and
-    by `GUESS` where no camera sees it. Lazy greedy selection: a strand's marginal coverage only
-    falls.
-    """
-    dense = strands.resampled(lines.width)
-    tangents = dense.tangents()
-    hidden = ~exposed(dense.points, surfaces, lines.width)
-    value = GUESS * hidden + lines.support(dense.points, tangents)
-    cells = _cells(dense.points, tangents, lines.width)
-    best = np.zeros(int(cells.max(initial=-1)) + 1)
-    ends = dense.offsets
-    own = [_mean_by(cells[a:b], value[a:b]) for a, b in pairwise(ends)]
-    count = np.diff(ends)
-
-    def gain(i: int) -> float:
-        cell, there = own[i]
-        return float(np.maximum(there - best[cell], 0).sum()) / float(count[i])
-
-    heap = [(-gain(i), i) for i in range(len(own))]
-    heapq.heapify(heap)
-    kept = np.zeros(len(own), bool)
-    while heap:
-        _, i = heapq.heappop(heap)
-        now = gain(i)
-        if now < marginal_coverage:
-            continue
-        if heap and now < -heap[0][0]:
-            heapq.heappush(heap, (-now, i))
-            continue
-        kept[i] = True
-        cell, there = own[i]
-        best[cell] = np.maximum(best[cell], there)
-    return kept
-
-
-def _cells(points: AnyFloats, tangents: AnyFloats, width: float) -> Ints:
-    """Numbers `(N,)`, from 0 on, of the cells of place and direction that points lie in."""
-    heading = np.abs(tangents @ half_sphere(HEADINGS).T.astype(np.float32)).argmax(axis=1)
-    place = np.floor(points / width).astype(np.int64)
-    place -= place.min(axis=0, initial=0)
-    size = place.max(axis=0, initial=0) + 1
-    flat = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * HEADINGS + heading
-    return np.unique(flat, return_inverse=True)[1].ravel().astype(np.int64)
-
-
-def _mean_by(cells: Ints, value: Array) -> tuple[Ints, Array]:
-    """The different ones of `cells (N,)` and the mean of `value (N,)` in each."""
-    cell, member, count = np.unique(cells, return_inverse=True, return_counts=True)
-    return cell, np.bincount(member.ravel(), value, len(cell)) / count
 
 
 def residuals(strands: Strands, lines: Lines) -> dict[str, float]:

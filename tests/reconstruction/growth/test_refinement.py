@@ -8,14 +8,9 @@ from scipy.spatial import cKDTree
 
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
-from reconstruction.growth.refinement import (
-    Lines,
-    _product,
-    _solve,
-    refine,
-    supported,
-    without_exposed_ends,
-)
+from reconstruction.growth.lines import Lines
+from reconstruction.growth.refinement import _product, _solve, refine, supported
+from reconstruction.growth.selection import without_exposed_ends
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
 
