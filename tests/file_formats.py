@@ -156,6 +156,20 @@ def _floats(count: int) -> bytes:
     return np.linspace(-1, 1, count, dtype="<f4").tobytes()
 
 
+STRANDS_PLY = b"ply\nformat ascii 1.0\nelement vertex 12\n"
+STRANDS_PLY += b"".join(b"property float %c\n" % c for c in b"xyz")
+STRANDS_PLY += b"property uchar red\nend_header\n"
+STRANDS_PLY += b"".join(b"%d 0 %d %d\n" % (k // 4, k % 4, k // 4) for k in range(12))
+CUBIC = b"""#usda 1.0
+def BasisCurves "hair" {
+    uniform token type = "cubic"
+    uniform token basis = "catmullRom"
+    uniform token wrap = "pinned"
+    int[] curveVertexCounts = [3, 4]
+    point3f[] points = [(0,0,0), (0,0,1), (0,1,1), (1,0,0), (1,0,1), (1,1,1), (1,2,1)]
+    float[] widths = [0.1, 0.1, 0, 0.1, 0.1, 0.1, 0]
+}
+"""
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n%send_header\n" % b"".join(
     b"property float %s\n" % n for n in (b"x", b"y", b"z", b"nx", b"ny", b"nz")
 )
@@ -304,6 +318,13 @@ FORMATS = {
         struct.pack("<ii", 2, 4) + _floats(12) + struct.pack("<i", 3) + _floats(9),
         read_strands,
     ),
+    "headerless_hair": _file(
+        "strands.hair",
+        struct.pack("<2I3H", 3, 16, 5, 4, 7) + _floats(48),
+        read_strands,
+    ),
+    "ply_strands": _file("strands.ply", STRANDS_PLY, read_strands),
+    "cubic_curves": _file("strands.usda", CUBIC, read_strands),
     "obj": _obj,
     "poses": _numpy(
         "poses.npz", read_poses, points=np.ones((2, 4, 3), np.float32), offsets=np.array([0, 4])
@@ -341,6 +362,8 @@ FORMATS = {
     "colmap_binary": _cameras(writers.write_colmap_binary, "sparse", "images.bin"),
     "metashape": _cameras(writers.write_metashape, "cameras.xml"),
     "transforms": _cameras(writers.write_transforms, "transforms.json"),
+    "easymocap": _cameras(writers.write_easymocap, "calib", "intri.yml"),
+    "metashape_rig": _cameras(writers.write_rig, "rig.xml"),
     "opencv": _cameras(writers.write_opencv, "opencv", "cam_0.yml"),
     "toml": _toml,
     "options": _json(

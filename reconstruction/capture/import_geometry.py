@@ -51,6 +51,7 @@ class GeometryFiles:
 
 
 CAMERA_FILES = ("sparse/0", "sparse", "transforms.json", "cameras.xml")
+CAMERA_FILES += ("intri.yml", "calib/intri.yml")
 LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
 
 
@@ -66,7 +67,7 @@ def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
         if cameras is None:
             raise PlacementError(
                 f"{folder}: no file of cameras: give --cameras (a COLMAP folder, transforms.json, "
-                "a Metashape or OpenCV file) or add cameras.json"
+                "a Metashape, OpenCV or EasyMocap file) or add cameras.json"
             )
     if cameras is not None and lights is None and not (folder / "lights.json").is_file():
         lights = next((p for n in LIGHT_FILES if (p := folder / n).exists()), None)

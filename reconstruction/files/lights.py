@@ -223,34 +223,27 @@ def _vertices(path: Path) -> list[dict[str, Any]]:
 def _table(path: Path) -> list[dict[str, Any]]:
     lines = [(n, x) for n, x in enumerate(read_text(path).splitlines(), 1) if x.strip(" \t,;")]
     rows = [(n, x) for n, x in lines if not x.lstrip().startswith("#")]
-    decimal_comma = any(";" in x for _, x in rows)
-    between = next((c for c in (";", ",", "\t") if any(c in x for _, x in rows)), None)
+    between = next((c for c in (";", "\t", ",") if any(c in x for _, x in rows)), None)
 
     def cells(line: str) -> list[str]:
         if between is None:
             return line.split()
-        return [
-            w.strip() for w in next(csv.reader([line], delimiter=between, skipinitialspace=True))
-        ]
+        if between == ";":
+            line = line.replace(",", ".")
+        return [w.strip() for w in next(csv.reader([line], delimiter=between))]
 
-    # NumPy and COLMAP write the header as a comment
+    # NumPy writes the header as a comment
     for number, line in lines if rows else []:
         if number > rows[0][0]:
             break
         columns = [w.lower() for w in cells(line.lstrip(" \t#"))]
         if len(set("xyz") & {m["axis"] for w in columns if (m := _PLACE.fullmatch(w))}) == 3:
             values = [(n, x) for n, x in rows if n > number]
-            return [_named_row(columns, cells(x), path, n, decimal_comma) for n, x in values]
-    out = []
-    for number, line in rows:
-        words = [w.replace(",", ".") if decimal_comma else w for w in cells(line)]
-        out.append(_row(words, path, number))
-    return out
+            return [_named_row(columns, cells(x), path, n) for n, x in values]
+    return [_row(cells(x), path, n) for n, x in rows]
 
 
-def _named_row(
-    columns: list[str], words: list[str], path: Path, line: int, decimal_comma: bool
-) -> dict[str, Any]:
+def _named_row(columns: list[str], words: list[str], path: Path, line: int) -> dict[str, Any]:
     while len(words) > len(columns) and not words[-1]:
         words.pop()
     if len(words) != len(columns) or len(set(columns)) != len(columns):
@@ -259,14 +252,13 @@ def _named_row(
         )
     row: dict[str, Any] = {}
     for column, word in zip(columns, words, strict=True):
-        number = word.replace(",", ".") if decimal_comma else word
         colour = _COLOUR.fullmatch(column)
         if _NAME.fullmatch(column) and word and "name" not in row:
             row["name"] = word
         elif _PLACE.fullmatch(column):
-            row[column] = _float(number, path, line)
+            row[column] = _float(word, path, line)
         elif colour or (column == "intensity" and word):
-            row[f"intensity {colour[1][0]}" if colour else column] = _float(number, path, line)
+            row[f"intensity {colour[1][0]}" if colour else column] = _float(word, path, line)
         elif word:
             row[column] = word
     if {f"intensity {c}" for c in "rgb"} <= set(row):

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.containment import plain_file
 from reconstruction.files.cameras.errors import CameraFile, CameraFileError, camera_of, pinhole_K
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens_models import LensModel
+from reconstruction.reading import read_text
 
 HEAD = "tc camera calibration"
 WIDTH = 4096
@@ -25,7 +25,7 @@ def read_calib(path: Path) -> CameraFile:
 
     The distortion is OpenCV's k1, k2, p2, p1, k3. Raises `CameraFileError`.
     """
-    lines = plain_file(path).read_text().splitlines()
+    lines = read_text(path).splitlines()
     if not lines or not lines[0].startswith(HEAD):
         raise CameraFileError(f"{path}: does not begin with {HEAD!r}")
     blocks: list[dict[str, list[str]]] = []

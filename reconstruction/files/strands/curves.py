@@ -33,18 +33,13 @@ def segment_counts(basis: str, counts: Ints, pinned: bool) -> Ints | None:
 
 
 def on_curve(
-    basis: str,
-    points: Array,
-    counts: Ints,
-    widths: Array,
-    pinned: bool,
-    varying: Array | None = None,
+    basis: str, points: Array, counts: Ints, widths: Array, pinned: bool, varying: bool
 ) -> tuple[Array, Ints, Array]:
     """Points `(M, 3)` on the curves with control points `(N, 3)`, their counts and widths `(M,)`.
 
-    `widths (N,)` are of the control points; `varying` are of the ends of segments instead.
+    `widths` are of the control points, or, if `varying`, of the ends of segments.
     """
-    values = np.column_stack([points, widths])
+    values = np.column_stack([points, np.zeros(len(points)) if varying else widths])
     segments = segment_counts(basis, counts, pinned)
     assert segments is not None
     first = np.cumsum(counts) - counts
@@ -59,9 +54,9 @@ def on_curve(
     nth = np.arange(len(curve)) - np.repeat(np.cumsum(segments) - segments, segments)
     start = first[curve] + nth * (3 if basis == "bezier" else 1)
     bezier = TO_BEZIER[basis] @ values[start[:, None] + np.arange(4)]
-    if varying is not None:
-        left = varying[np.arange(len(curve)) + curve]
-        right = varying[np.arange(len(curve)) + curve + 1]
+    if varying:
+        end = np.arange(len(curve)) + curve
+        left, right = widths[end], widths[end + 1]
         bezier[..., 3] = left[:, None] + (right - left)[:, None] * np.arange(4) / 3
     bend = np.linalg.norm(np.diff(bezier[..., :3], n=2, axis=1), axis=2).max(axis=1, initial=0)
     chords = np.clip(np.ceil(np.sqrt(0.75 * bend / TOLERANCE)), 1, MOST).astype(np.int64)

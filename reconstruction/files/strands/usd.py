@@ -16,7 +16,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from reconstruction.arrays import Array, Floats, Ints
 from reconstruction.files.durable import writing
-from reconstruction.files.strands.curves import on_curve, segment_counts
+from reconstruction.files.strands.curves import TO_BEZIER, on_curve, segment_counts
 from reconstruction.files.strands.errors import StrandFileError, radii
 from reconstruction.geometry.strands import Strands
 
@@ -60,10 +60,16 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Array]:
     """Points in metres, vertex counts and widths of the points of one prim."""
     curves = UsdGeom.BasisCurves(prim)
     where = prim.GetPath()
-    cubic = curves.GetTypeAttr().Get() != UsdGeom.Tokens.linear
-    wrap, basis = curves.GetWrapAttr().Get(), curves.GetBasisAttr().Get() if cubic else "linear"
+    kind, basis, wrap = (
+        attribute.Get()
+        for attribute in (curves.GetTypeAttr(), curves.GetBasisAttr(), curves.GetWrapAttr())
+    )
     if wrap == UsdGeom.Tokens.periodic:
         raise StrandFileError(f"{where}: closed (periodic) curves are not strands")
+    basis = "linear" if kind == UsdGeom.Tokens.linear else basis
+    known = kind in ("linear", "cubic") and wrap in ("nonperiodic", "pinned")
+    if not known or basis not in ("linear", *TO_BEZIER):
+        raise StrandFileError(f"{where}: {kind} curves of basis {basis}, {wrap}, are not read")
     points = np.asarray(curves.GetPointsAttr().Get(_START) or [], np.float64).reshape(-1, 3)
     counts = np.asarray(curves.GetCurveVertexCountsAttr().Get(_START) or [], np.int64)
     if (counts < 2).any() or counts.sum() != len(points):
@@ -81,45 +87,29 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Array]:
     widths = widths * scale
     if len(widths) == 0:
         widths, interpolation = np.array([8e-5]), UsdGeom.Tokens.constant
-    pinned = wrap == UsdGeom.Tokens.pinned
-    segments = segment_counts(basis, counts, pinned)
+    segments = segment_counts(basis, counts, wrap == "pinned")
     if segments is None:
         raise StrandFileError(
             f"{where}: cubic {basis} curves of {int(counts.min())} to {int(counts.max())} points "
             "do not end at a segment's end"
         )
-    sizes = {"constant": 1, "uniform": len(counts), "varying": int((segments + 1).sum())}
-    sizes |= {"vertex": len(points)}
-    if sizes.get(interpolation) != len(widths):
-        fits = [
-            name
-            for name in ("constant", "vertex", "varying", "uniform")
-            if sizes[name] == len(widths)
-        ]
-        if not fits:
-            raise StrandFileError(
-                f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
-            )
-        interpolation = fits[0]
-    if interpolation == "constant":
-        widths = np.repeat(widths, len(points))
-    elif interpolation == "uniform":
-        widths = np.repeat(widths, counts)
-    if basis == "linear":
-        return world.astype(np.float32), counts, widths
-    varying = widths if interpolation == "varying" else None
-    world, counts, widths = on_curve(
-        basis,
-        world,
-        counts,
-        np.zeros(len(points)) if varying is not None else widths,
-        pinned,
-        varying,
-    )
+    sizes = {"constant": 1, "vertex": len(points), "varying": int((segments + 1).sum())}
+    sizes["uniform"] = len(counts)
+    if sizes.get(interpolation) != len(widths):  # its default contradicts the widths
+        interpolation = next((name for name in sizes if sizes[name] == len(widths)), None)
+    if interpolation is None:
+        raise StrandFileError(
+            f"{where}: {len(widths)} widths for {len(counts)} curves with {len(points)} points"
+        )
+    if interpolation in ("constant", "uniform"):
+        widths = np.repeat(widths, len(points) if len(widths) == 1 else counts)
+    if basis != "linear":
+        varying = interpolation == "varying"
+        world, counts, widths = on_curve(basis, world, counts, widths, wrap == "pinned", varying)
     return world.astype(np.float32), counts, np.maximum(widths, 0)
 
 
-def _widths(curves: Any) -> tuple[Array, str]:
+def _widths(curves: Any) -> tuple[Array, str | None]:
     """Widths and their interpolation; the primvar comes before the attribute (UsdGeomCurves)."""
     primvar = UsdGeom.PrimvarsAPI(curves).GetPrimvar("widths")
     if primvar and primvar.HasValue():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -228,13 +229,43 @@ def test_files_in_other_units_than_metres_are_named(folder: Path, tmp_path: Path
     import_folder(folder, tmp_path / "out")
 
 
-def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
-    """A COLMAP model in millimetres for pictures of twice the size, lights as directions."""
+def colmap_model(folder: Path) -> Path:
+    """Two cameras 1,000 mm from the origin, at right angles, of twice the pictures' size."""
     sparse = folder / "sparse"
     sparse.mkdir()
     (sparse / "cameras.txt").write_text("3 PINHOLE 16 12 100 100 8 6\n")
     images = ["1 1 0 0 0 0 0 1000 3 cam_00/all.jpg", "", "2 1 0 1 0 10 0 1000 3 left/all.jpg", ""]
     (sparse / "images.txt").write_text("\n".join(images))
+    return sparse
+
+
+@pytest.mark.parametrize("pictures", ["0 7", "00 07", "Light_000 Light-07", "light_0 light_007"])
+@pytest.mark.parametrize("ids", ["0 7", "00 07", "light_00 light_07", "0.0 7.0"])
+def test_lights_of_a_table_are_matched_to_the_pictures_by_number(
+    folder: Path, tmp_path: Path, pictures: str, ids: str
+) -> None:
+    """And placed by the unit in the table's header, whatever that of the cameras is."""
+    for camera, (old, new) in product(CAMERAS, zip(LIGHTS, pictures.split(), strict=True)):
+        file = folder / "images" / camera / f"{old}.exr"
+        file.rename(file.with_name(f"{new}.exr"))
+    first, second = ids.split()
+    (folder / "lights.csv").write_text(f"id,x_cm,y_cm,z_cm\n{second},0,90,0\n{first},0,0,-80\n")
+    where = PlacementOptions(unit="mm", up="-y")
+    files = GeometryFiles(colmap_model(folder), folder / "lights.csv", placement=where)
+    capture = import_folder(folder, tmp_path / "out", geometry=read_geometry(files))
+    by_name = {light.name: light.position for light in capture.rig.lights}
+    seventh, zeroth = (by_name[name] for name in sorted(by_name, reverse=True))
+    # down and ahead, 0, 0.9 and -0.8 m, become -z and y
+    np.testing.assert_allclose(seventh - zeroth, [0, 0.8, -0.9], atol=1e-9)
+    found = {
+        light: capture.olat("left")[0][i, 0, 0, 0] for i, light in enumerate(capture.olat_lights())
+    }
+    assert [found[name] for name in sorted(found)] == [10, 11]
+
+
+def test_cameras_and_lights_of_others(folder: Path, tmp_path: Path) -> None:
+    """A COLMAP model in millimetres for pictures of twice the size, lights as directions."""
+    sparse = colmap_model(folder)
     directions = {"light_00": [0, -1, 0], "light_07": [0, 0, 1]}
     (folder / "lights.json").write_text(json.dumps(directions))
     where = PlacementOptions(unit="mm", up="-y")
