@@ -50,8 +50,10 @@ class GeometryFiles:
     placement: PlacementOptions = PlacementOptions()
 
 
-CAMERA_FILES = ("sparse/0", "sparse", "transforms.json", "cameras.xml")
-CAMERA_FILES += ("intri.yml", "calib/intri.yml")
+CAMERA_FILES = (
+    *("sparse/0", "sparse", "transforms.json", "cameras.xml"),
+    *("intri.yml", "calib/intri.yml"),
+)
 LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
 
 

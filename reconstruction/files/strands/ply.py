@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.arrays import Floats, Ints
+from reconstruction.arrays import Bools, Floats
 from reconstruction.files.ply import read_ply
 from reconstruction.files.strands.errors import StrandFileError, require_finite
 from reconstruction.geometry.strands import Strands
 
 GAP = 3.0
 SHARE = 0.5
-"""Least share of the strands' ends that are gaps, and of the turns that are under 60 degrees."""
+"""Least share of ends that are where they must be, and of turns under 60 degrees."""
 _NUMBERS = ("strand", "strand_id", "strand_index", "hair_id", "curve_id")
 _COLOURS = ("red", "green", "blue", "alpha")
 
@@ -35,46 +35,60 @@ def read_ply_strands(path: Path) -> Strands:
     require_finite(points, np.arange(len(points)))
     if len(points) < 2:
         raise StrandFileError(f"{len(points)} vertices make no strand")
-    last = len(points) - 1
     if edges := elements.get("edge"):
-        first, second = (edges[f"vertex{k}"].astype(np.int64) for k in (1, 2))
-        if (np.abs(second - first) != 1).any() or min(first.min(), second.min()) < 0:
-            raise StrandFileError("an edge joins vertices that do not follow each other")
-        joined = np.zeros(len(points), bool)
-        joined[np.minimum(first, second)] = True
-        return _split(points, np.flatnonzero(~joined[:last]))
-    for names in ([n for n in _NUMBERS if n in vertices], [n for n in _COLOURS if n in vertices]):
-        if not names:
-            continue
-        keys = np.stack([vertices[n] for n in names], axis=1)
-        ends = np.flatnonzero((keys[1:] != keys[:-1]).any(axis=1))
-        if names[0] in _NUMBERS:
-            return _split(points, ends)
-        if len(ends) and (count := _common(ends, len(points))) >= 2:
-            return _even(points, count)
+        return _split(points, ~_joined(edges, len(points)))
+    number = next((vertices[n] for n in _NUMBERS if n in vertices), None)
+    if number is not None:
+        return _split(points, number[1:] != number[:-1])
     steps = np.diff(points, axis=0)
     step = np.linalg.norm(steps, axis=1)
-    beside = np.maximum(np.append(step[1:], 0), np.append(0, step[:-1]))
-    gaps = np.flatnonzero(step > GAP * beside)
-    count = _common(gaps, len(points))
+    gaps = step > GAP * np.maximum(np.append(step[1:], 0), np.append(0, step[:-1]))
+    colours = np.stack([vertices.get(n, np.zeros(len(points))) for n in _COLOURS], axis=1)
+    count = _common((colours[1:] != colours[:-1]).any(axis=1))
+    if not count or _hits(gaps, count) < SHARE:
+        count = _common(gaps)
     straight = np.einsum("ni,ni->n", steps[1:], steps[:-1]) > 0.5 * step[1:] * step[:-1]
-    few = len(gaps) < SHARE * (len(points) // count - 1)
-    if count < 3 or few or straight.mean() < SHARE:
+    if not count or straight.mean() < SHARE:
         raise StrandFileError(
             "the strands' ends are unknown: vertices need a strand_id, one colour for each strand, "
             "edges, or the same number of points for each strand"
         )
-    return _even(points, count)
-
-
-def _common(ends: Ints, vertices: int) -> int:
-    """The most points of strands that all end at some of `ends`."""
-    return int(np.gcd.reduce(np.append(ends + 1, vertices)))
-
-
-def _even(points: Floats, count: int) -> Strands:
     return Strands(points, np.arange(0, len(points) + 1, count))
 
 
-def _split(points: Floats, ends: NDArray[Any]) -> Strands:
-    return Strands(points, np.concatenate([[0], ends + 1, [len(points)]]))
+def _joined(edges: dict[str, NDArray[Any]], vertices: int) -> Bools:
+    """Whether an edge joins each vertex and the next `(N - 1,)`."""
+    if not {"vertex1", "vertex2"} <= set(edges):
+        raise StrandFileError(f"an edge has {list(edges)}, expected vertex1 and vertex2")
+    first, second = (edges[f"vertex{k}"].astype(np.int64) for k in (1, 2))
+    low = np.minimum(first, second)
+    if (np.abs(second - first) != 1).any() or (low < 0).any() or (low > vertices - 2).any():
+        raise StrandFileError("an edge joins vertices that do not follow each other")
+    joined = np.zeros(vertices - 1, bool)
+    joined[low] = True
+    return joined
+
+
+def _hits(ends: Bools, count: int) -> float:
+    """Share of `ends` that lie between strands of `count` points."""
+    return float(((np.flatnonzero(ends) + 1) % count == 0).mean()) if ends.any() else 1.0
+
+
+def _common(ends: Bools) -> int:
+    """The points of each strand, if `ends` are mostly theirs and theirs are mostly among `ends`."""
+    vertices, best, score = len(ends) + 1, 0, SHARE
+    if not ends.any():
+        return vertices
+    small = np.arange(1, int(vertices**0.5) + 1)
+    small = small[vertices % small == 0]
+    for count in sorted({*small.tolist(), *(vertices // small).tolist()} - {1, 2, vertices}):
+        hits = _hits(ends, count)
+        share = hits * ends.sum() / (vertices / count - 1)
+        if hits * share > score:
+            best, score = count, hits * share
+    return best
+
+
+def _split(points: Floats, ends: Bools) -> Strands:
+    """Strands that end at the points `ends (N - 1,)`, and at the last."""
+    return Strands(points, np.concatenate([[0], np.flatnonzero(ends) + 1, [len(points)]]))

@@ -95,7 +95,7 @@ def _curves(prim: Any, cache: Any, turn: Array) -> tuple[Floats, Ints, Array]:
         )
     sizes = {"constant": 1, "vertex": len(points), "varying": int((segments + 1).sum())}
     sizes["uniform"] = len(counts)
-    if sizes.get(interpolation) != len(widths):  # its default contradicts the widths
+    if sizes.get(str(interpolation)) != len(widths):  # its default contradicts the widths
         interpolation = next((name for name in sizes if sizes[name] == len(widths)), None)
     if interpolation is None:
         raise StrandFileError(

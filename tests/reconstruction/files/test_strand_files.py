@@ -681,19 +681,22 @@ def write_ply(path: Path, points: np.ndarray, columns: dict[str, np.ndarray], fo
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("how", ["colours", "twins", "gaps", "numbers", "edges"])
+@pytest.mark.parametrize("how", ["colours", "twins", "groups", "gaps", "numbers", "edges"])
 def test_strands_of_a_ply(form: str, how: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     roots = 0.08 * rng.normal(size=(12, 1, 3))
     length = rng.uniform(0.02, 0.3, (12, 1, 1))
     points = roots + length * np.linspace(0, 1, 25)[:, None] * (0, 0, 1)
     points += 0.01 * np.sin(20 * points[..., :1])
+    points[3, 11] += 0.05  # a kink is no end
     points, counts = points.reshape(-1, 3).astype(np.float32), np.full(12, 25)
     columns, edges = {}, None
-    if how in ("colours", "twins"):
+    if how in ("colours", "twins", "groups"):
         colour = rng.integers(0, 255, (12, 3))
         if how == "twins":  # two neighbours of one colour
             colour[4] = colour[5]
+        if how == "groups":
+            colour[:6], colour[6:] = 7, 9
         columns = dict(zip(("red", "green", "blue"), np.repeat(colour, 25, 0).T, strict=True))
     elif how != "gaps":
         counts = np.array([25, 50, 20, 5, *[25] * 8])
@@ -712,6 +715,10 @@ def test_a_ply_whose_strands_are_unknown_is_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "s.ply", cloud, {}, "ascii")
     with pytest.raises(StrandFileError, match="the strands' ends are unknown"):
         read_strands(tmp_path / "s.ply")
+    for edge in ([0, 2], [299, 300], [-1, 0]):
+        write_ply(tmp_path / "s.ply", cloud, {}, "ascii", np.array([edge]))
+        with pytest.raises(StrandFileError, match="an edge joins vertices that do not follow"):
+            read_strands(tmp_path / "s.ply")
 
 
 def test_long_strands_are_resampled_by_arc_length() -> None:
