@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 from serving import refused, serving
+from waiting import until
 
+from reconstruction import Model
 from stage_service.api.gate import Access
 from stage_service.api.prefix import checked
 from stage_service.records.tokens import Tokens
@@ -29,6 +31,15 @@ def test_every_path_is_served_with_and_without_its_prefix(rig_file, tmp_path, wo
         made = http.post(f"{sent}/captures", json={"plan": {"lights": ["light_000"]}})
         assert made.headers["location"] == f"/stage/captures/{made.json()['id']}"
         assert http.get(made.headers["location"]).json()["id"] == made.json()["id"]
+        until(lambda: http.service.capture(made.json()["id"]).outcome == "completed")
+        model = Model(http.service.root / "models" / "mine").create()
+        model.file("index.html").write_text("its page")
+        pipeline = {"name": "light_planes"}
+        planes = {"capture": made.json()["id"], "pipeline": pipeline, "model": "mine"}
+        job = http.post(f"{sent}/jobs", json=planes).json()["id"]
+        folder = f"/stage/jobs/{job}/artifacts/"
+        policy = http.get(f"{folder}index.html").headers["content-security-policy"]
+        assert f"img-src 127.0.0.1:{port}{folder} data:" in policy  # its own images alone
         assert http.get("/stage/openapi.json").json()["servers"] == [{"url": "/stage"}]
         assert http.post(f"{sent}/devices/blackout").json()["state"] == "dark"
         assert not world.lit

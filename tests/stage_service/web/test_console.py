@@ -445,4 +445,4 @@ def test_a_job_with_strands_links_to_the_viewer(console):
     job = http.post("/jobs", json=request).json()["id"]
     page = pages.open(f"jobs/{job}")
     link = page.wait_for_selector("a:text-is('View the strands')")
-    assert link.get_attribute("href") == "/view#model=mine"
+    assert link.evaluate("a => a.href") == f"{pages.url}/view#model=mine"
