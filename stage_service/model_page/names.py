@@ -1,4 +1,4 @@
-"""Titles of results on the terminal, in the benchmark's table and on the page."""
+"""Titles of results and captions, on the terminal, in the benchmark's table and on the page."""
 
 from __future__ import annotations
 
@@ -33,6 +33,16 @@ PICTURES = {
     "three_nearest": "three nearest lights",
     "nearest_cameras": "three nearest cameras",
     "three_nearest_own_frames": "three nearest lights in that camera's own frames",
+}
+HERO = ("relit.png", "render.png", "comparison.png")
+"""The image at the top of the page: the first that exists."""
+SHOWN = {
+    "relit.png": "The result under a new environment map.",
+    "relit.webp": "The same under the turning environment.",
+    "comparison.png": "Held-out frames: captured, rendered, and baselines.",
+    "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
+    "render.png": "The latest image of hairstage render.",
+    "plots/geometry.png": "Strands, baselines and true directions against the true strands.",
 }
 
 

@@ -25,8 +25,10 @@ from stage_service.model_page.html import (
 from stage_service.model_page.html import seconds as time_text
 from stage_service.model_page.names import (
     GROUPS,
+    HERO,
     OF_TRUTH,
     PICTURES,
+    SHOWN,
     STRAND_FIGURES,
     STRANDS,
     consistency_cells,
@@ -36,16 +38,6 @@ from stage_service.model_page.names import (
 from stage_service.model_page.plots import error_plots, time_bars
 
 PAGE, FIELD_FILE = "index.html", "field.npz"
-HERO = ("relit.png", "render.png", "comparison.png")
-"""The image at the top: the first that exists."""
-SHOWN = {
-    "relit.png": "The result under a new environment map.",
-    "relit.webp": "The same under the turning environment.",
-    "comparison.png": "Held-out frames: captured, rendered, and baselines.",
-    "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
-    "render.png": "The latest image of hairstage render.",
-    "plots/geometry.png": "Strands, baselines and true directions against the true strands.",
-}
 
 
 def write_page(model: Model, label: str = "") -> Path:
