@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
+from reconstruction.light_codes.line_strands import roots_first
 from reconstruction.light_planes import PointCloud
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
@@ -28,6 +29,14 @@ HEAD_OF_HAIR = 100_000 * 40e-6
 """Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
 SPACING = 2e-3  # metres between a written strand's points
+
+
+@dataclass(frozen=True)
+class Grown:
+    """Strands, and whether they have roots on the scalp."""
+
+    strands: Strands
+    rooted: bool
 
 
 class GrowingStages(Stages):
@@ -66,11 +75,12 @@ class GrowingStages(Stages):
         scalp: Scalp,
         measured: list[AnyFloats],
         within: float | None = None,
-    ) -> Strands:
+    ) -> Grown:
         """Strands from the scalp, then through the gaps between them, all rooted.
 
-        `measured` polylines `(N, 3)` and those through gaps are rooted alike. `within` in metres:
-        see `fill_gaps`.
+        `measured` polylines `(N, 3)` and those through gaps are rooted alike. If fewer of them
+        reach the scalp than do not, as where cameras show the end of a tail, none has a root.
+        `within` in metres: see `fill_gaps`.
         """
         o = self.options
         with self.report.stage("strands") as stage:
@@ -90,12 +100,14 @@ class GrowingStages(Stages):
             self.progress("rooting strands", 0.7)
             loose = [polyline.astype(np.float32) for polyline in measured] + gaps
             result = root_all(rooted, loose, scalp)
-            if not result.strands:
+            reached = result.dropped <= len(result.strands)
+            paths = result.strands if reached else roots_first([*rooted, *loose], None)
+            if not paths:
                 raise CaptureError(
                     "no strand could be grown: the envelope does not reach the scalp"
                 )
             # traced both ways and connected to the scalp, they may be twice as long
-            strands = Strands.from_list([*result.strands]).cut(o.max_length).resampled(SPACING)
+            strands = Strands.from_list([*paths]).cut(o.max_length).resampled(SPACING)
             stage.figures.update(
                 strands=len(strands),
                 from_roots=len(rooted),
@@ -103,17 +115,19 @@ class GrowingStages(Stages):
                 through_gaps=len(loose),
                 gaps_led_to_scalp=result.to_scalp,
                 gaps_joined_to_strand=result.joined,
-                gaps_dropped=result.dropped,
+                gaps_dropped=result.dropped if reached else 0,
                 covered_by_roots=share,
                 covered=filled,
                 metres=float(strands.lengths().sum()),
                 options=asdict(o),
             )
             if result.dropped:
+                consequence = "were removed" if reached else "no strand is rooted"
                 stage.warn(
-                    f"{result.dropped} strands could not be connected to the scalp and were removed"
+                    f"{result.dropped} of {len(rooted) + len(loose)} strands could not be "
+                    f"connected to the scalp: {consequence}"
                 )
-        return strands
+        return Grown(strands, reached)
 
     def refined(
         self,
@@ -148,10 +162,18 @@ class GrowingStages(Stages):
         return strands
 
     def rooted(
-        self, strands: Strands, measured: Measured, scalp: Scalp, flat: ScalpMap | None
+        self, strands: Strands, measured: Measured, scalp: Scalp | None, flat: ScalpMap | None
     ) -> None:
-        """Write rooted strands, and their roots on the scalp's map; `flat` is the head's own."""
+        """Write rooted strands, and their roots on the scalp's map; `flat` is the head's own.
+
+        Without a `scalp` no strand has a root.
+        """
         with self.report.stage("roots") as stage:
+            if scalp is None:
+                why = "the hair that cameras show does not reach the scalp"
+                stage.leave_out("roots", why, "this stage; strands begin at their higher end")
+                self.unrooted(strands, measured, stage)
+                return
             strands = replace(strands, radius=self._radius(len(strands)))
             self._write(strands, measured, stage)
             write_root_map(self.model, strands, scalp, flat, stage)

@@ -136,8 +136,8 @@ class _Run:
             scalp = find_scalp(head.mesh, envelope)
             field = growing.field(envelope, measured, scalp)
             grown = growing.grown(field, scalp, polylines, options.within)
-            grown = growing.refined(grown, measured, cloud, masked.cameras, depths, scale)
-            growing.rooted(grown, lines, scalp, head.scalp_map)
+            strands = growing.refined(grown.strands, measured, cloud, masked.cameras, depths, scale)
+            growing.rooted(strands, lines, scalp if grown.rooted else None, head.scalp_map)
 
     def line_stereo(
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]
@@ -193,8 +193,10 @@ class _Run:
         within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
             grown = self.growing.grown(field, scalp, polylines, within)
-            grown = self.growing.refined(grown, measured, cloud, masked.cameras, depths, scale)
-            self.growing.rooted(grown, written, scalp, head.scalp_map)
+            strands = self.growing.refined(
+                grown.strands, measured, cloud, masked.cameras, depths, scale
+            )
+            self.growing.rooted(strands, written, scalp if grown.rooted else None, head.scalp_map)
             return
         with report.stage("strands") as stage:
             coverage, tracing = Coverage(field), Tracing(max_length=o.max_length)

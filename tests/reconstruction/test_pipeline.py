@@ -445,6 +445,25 @@ def test_observed_strands_are_not_covered_by_roots(
     assert figures["covered_by_roots"] == 0
 
 
+def test_hair_far_from_the_scalp_is_kept_without_roots(tmp_path: Path) -> None:
+    """A tail 15 cm behind the head: its strands stay where they were measured, upper end first."""
+    grid = VoxelGrid(np.array([-4e-3, 0.25, -0.1]), 4e-3, np.ones((3, 3, 10), bool))
+    field, _ = solve_field(grid, grid.centers(), np.tile([0, 0, 1.0], (90, 1)))
+    observed = [p.astype(np.float32) for p in grid.centers().reshape(9, 10, 3)]
+    stages = GrowingStages(Model(tmp_path).create(), QUICK, silent, Report())
+    scalp = find_scalp(ball(HEAD))
+    grown = stages.grown(field, scalp, list(observed))
+    assert not grown.rooted
+    assert grown.strands.lengths().sum() >= 9 * 36e-3 * (1 - 1e-5)
+    assert "no strand is rooted" in stages.report["strands"].warnings[0]
+    measured = Measured(grid.centers(), np.tile([0, 0, 1.0], (90, 1)), np.ones(90))
+    stages.rooted(grown.strands, measured, None, None)
+    written = read_strands(tmp_path / "strands.npz")
+    assert (written.roots[:, 2] > written.points[written.offsets[1:] - 1, 2]).all()
+    assert written.points[:, 1].min() > 0.24
+    assert stages.report["roots"].left_out
+
+
 def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
