@@ -29,7 +29,7 @@ METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "mm": 0.001, "in": 0
 METRES |= {"inch": 0.0254, "inche": 0.0254, "foot": 0.3048, "feet": 0.3048, "centimetre": 0.01}
 METRES |= {"centimeter": 0.01, "millimetre": 0.001, "millimeter": 0.001}
 """By name without a plural's s."""
-_UNIT = rf"(?:[ _.]*[ _.\[(](?P<unit>(?:{'|'.join(METRES)})s?)[\])]?)?"
+_UNIT = rf"(?:[ _.]*[ _.\[(/](?P<unit>(?:{'|'.join(METRES)})s?)[\])]?)?"
 _PLACE = re.compile(rf"(?:p|(?:position|pos)?[ _.]*)(?P<axis>[xyz]|position){_UNIT}")
 _NAME = re.compile("(?:light|lamp|led)?[ _]*(?:name|id|label|number|index|no)|light|lamp|led|#")
 _COLOUR = re.compile(r"(?:intensity[ _.]*)?(r|g|b|red|green|blue)")
@@ -182,6 +182,7 @@ def _entry(value: Any, path: Path, unit: float | None) -> dict[str, Any]:
     """A light's fields; its position in the file's unit, `metres` of that if it is stated."""
     if not isinstance(value, dict):
         return {"position": value, "metres": unit}
+    unit = _unit(value, path) or unit
     places = {k: m for k in value if (m := _PLACE.fullmatch(k.strip().lower()))}
     axes = {m["axis"]: k for k, m in places.items()}
     out = {k: v for k, v in value.items() if k in ("name", "id", "intensity", "colocated_camera")}
@@ -191,7 +192,7 @@ def _entry(value: Any, path: Path, unit: float | None) -> dict[str, Any]:
         out["position"] = [value[axes[a]] for a in "xyz"]
     elif "position" in axes:
         out["position"] = value[axes["position"]]
-    out["unused"] = [k for k in value if k not in out and k not in axes.values()]
+    out["unused"] = [k for k in value if k not in (*out, *axes.values(), "unit", "units")]
     stated = {m["unit"] for m in places.values()}
     if len(stated) > 1:
         raise LightFileError(f"{path}: {', '.join(places)}: expected one unit for x, y and z")

@@ -415,6 +415,20 @@ def test_what_easymocap_files_lack_is_named(tmp_path: Path) -> None:
         read_cameras(tmp_path / "b")
 
 
+def test_opencvs_calibration_tutorial(tmp_path: Path) -> None:
+    """Its names: Camera_Matrix, Distortion_Coefficients, image_Width, image_Height (XML)."""
+    camera = writers.stage()[1]
+    storage = cv2.FileStorage(str(tmp_path / "cam_01.xml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_Width", 640)
+    storage.write("image_Height", 480)
+    storage.write("Camera_Matrix", camera.K)
+    storage.write("Distortion_Coefficients", camera.distortion[:, None])
+    storage.write("rvec", cv2.Rodrigues(camera.R)[0])
+    storage.write("tvec", camera.t[:, None])
+    storage.release()
+    assert_same_pixels(read_cameras(tmp_path / "cam_01.xml").cameras, [camera])
+
+
 def test_a_lens_is_what_any_of_its_names_says(tmp_path: Path) -> None:
     """`fisheye_model` of OpenCV's calibration program, kalibr's pair of names, an unknown lens."""
     writers.write_map(tmp_path / "a.json", writers.stage()[1:2])
