@@ -21,6 +21,7 @@ from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.light_codes.line_strands import roots_first
 from reconstruction.light_planes import PointCloud
+from reconstruction.plausibility import check_face, check_strands
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
@@ -175,7 +176,8 @@ class GrowingStages(Stages):
                 self.unrooted(strands, measured, stage)
                 return
             strands = replace(strands, radius=self._radius(len(strands)))
-            self._write(strands, measured, stage)
+            self._write(strands, measured, stage, scalp.area)
+            check_face(strands, scalp.head, stage)
             write_root_map(self.model, strands, scalp, flat, stage)
 
     def unrooted(self, strands: Strands, measured: Measured, stage: Stage) -> None:
@@ -184,7 +186,9 @@ class GrowingStages(Stages):
             raise CaptureError("no strand was found: use the method 'hull', which fills the masks")
         self._write(replace(strands, radius=self._radius(len(strands))), measured, stage)
 
-    def _write(self, strands: Strands, measured: Measured, stage: Stage) -> None:
+    def _write(
+        self, strands: Strands, measured: Measured, stage: Stage, area: float | None = None
+    ) -> None:
         """Write strands, each point with its confidence by the `measured` lines."""
         lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
         confidence = supported(strands, lines)
@@ -194,6 +198,7 @@ class GrowingStages(Stages):
             radius=strands.radius,
             measured_share=float((confidence > 0).mean()),
         )
+        check_strands(strands, area, stage)
         self.model.write_strands(replace(strands, confidence=confidence))
 
     def _radius(self, count: int) -> float:

@@ -22,7 +22,9 @@ from reconstruction.files.numpy_files import read_arrays
 from reconstruction.files.strands import read_strands, write_strands
 from reconstruction.geometry.mesh import Mesh, read_obj, write_obj
 from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.world_frame import WorldFrame
 from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.options import BadOptions
 from reconstruction.reading import read_json
 from reconstruction.report.report import Report
 
@@ -34,6 +36,8 @@ FILES = {
     "strands.hair": "the strands for cyHair's readers",
     "strands.usdc": "the strands as USD curves",
     "points.npz": "the triangulated points",
+    "frame.json": "unit, up axis and origin of an imported capture's world, which strands and head "
+    "are in",
     "head.obj": "the fitted head, if the capture has none",
     "scalp_map.npz": "the roots' coordinates on the flat map of the scalp",
     "masks": "masks of hair and skin of every camera, in the pixels of its frames",
@@ -142,16 +146,36 @@ class Model:
                 sizes[name] = path.stat().st_size
         return sizes
 
+    @property
+    def frame(self) -> WorldFrame | None:
+        """The user's frame, which the files of strands and head are in; None for the stage's."""
+        if not self.has("frame.json"):
+            return None
+        try:
+            return WorldFrame.from_dict(self.json("frame.json"), str(self.file("frame.json")))
+        except (TypeError, BadOptions) as error:
+            raise ModelError(f"{self.file('frame.json')}: {error}") from error
+
+    def start(self, frame: WorldFrame | None) -> None:
+        """Let strands and head be written in `frame`; removes those in another one."""
+        record = None if frame is None else frame.to_dict()
+        if record == (self.json("frame.json") if self.has("frame.json") else None):
+            return
+        for name in ("strands.npz", "strands.hair", "strands.usdc", "head.obj", "frame.json"):
+            self.remove(name)
+        if record is not None:
+            self.write_json("frame.json", record)
+
     def strands(self) -> Strands:
-        """The strands. Raises `ModelError` without any."""
-        return read_strands(self._needed("strands.npz", _RECONSTRUCT))
+        """The strands, in the stage's frame. Raises `ModelError` without any."""
+        return read_strands(self._needed("strands.npz", _RECONSTRUCT), frame=self.frame)
 
     def write_strands(self, strands: Strands) -> None:
         """Write the strands in all three formats, after removing results from earlier ones."""
         self.forget_appearance()
         self.remove("scalp_map.npz")
         for suffix in ("npz", "hair", "usdc"):
-            write_strands(self.file(f"strands.{suffix}"), strands)
+            write_strands(self.file(f"strands.{suffix}"), strands, self.frame)
 
     def points(self) -> PointCloud:
         """The triangulated points; empty without a sweep."""
@@ -164,13 +188,14 @@ class Model:
     def head(self, capture: Capture | None) -> Mesh | None:
         """The head that later steps use: the fitted one, else the capture's."""
         if self.has("head.obj"):
-            return read_obj(self.file("head.obj"))
+            head, frame = read_obj(self.file("head.obj")), self.frame
+            return head if frame is None else frame.inputs(head)
         return capture.head if capture is not None else None
 
     def write_head(self, head: Mesh) -> None:
         """Write the fitted head."""
         with self.writing("head.obj") as temporary:
-            write_obj(temporary, head)
+            write_obj(temporary, head if self.frame is None else self.frame.results(head))
 
     def mask(self, camera: str, kind: MaskKind, capture: Capture) -> Bools:
         """The mask `(H, W)` of `camera`, in the pixels of `capture`'s frames.

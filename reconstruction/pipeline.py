@@ -69,7 +69,8 @@ def reconstruct(
     expected = STAGES[method_for(capture) if method == "auto" else method]
     report = ReportWithProgress(progress, expected)
     with cached_frames(capture, model.path) as kept:
-        run = _Run(Stages(model.create(), options, report.progress, report), kept)
+        model.create().start(capture.world if options.frame == "user" else None)
+        run = _Run(Stages(model, options, report.progress, report), kept)
         run.reconstruct(method, motion)
     if not any(stage.name == "head" for stage in report.stages):
         model.remove("head.obj")  # of an earlier reconstruction

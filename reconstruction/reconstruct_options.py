@@ -112,7 +112,8 @@ class ReconstructOptions:
     `scalp_points` is a file of digitised scalp points to fit a head to, `head_mesh` (OBJ) the head
     to fit instead of the generic one. Gaps are filled `within` metres of a measurement (None: 3 mm
     or two voxels, on a hull 12 mm); give more for wider pixels.
-    `radius` of the strands; None keeps a head of hair's coverage.
+    `radius` of the strands; None keeps a head of hair's coverage. `frame` is that of the written
+    strands and head: of the user's cameras, for an imported capture, or the stage's.
     """
 
     held_out: tuple[str, ...] = ()
@@ -124,6 +125,7 @@ class ReconstructOptions:
     head_mesh: str | None = None
     within: Length | None = None
     radius: Length | None = None
+    frame: Literal["user", "stage"] = "user"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     motion: MotionOptions = MotionOptions()
     measure: MeasureOptions = MeasureOptions()

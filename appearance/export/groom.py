@@ -16,6 +16,7 @@ from appearance.export.options import ExportOptions
 from appearance.model.fitted_model import FittedModel
 from reconstruction import Capture, Mesh, Model, Strands
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+from reconstruction.geometry.world_frame import WorldFrame
 
 MEASURED = 2e-3
 """Metres from a triangulated point at which the confidence of a strand's point is exp(-1/2)."""
@@ -83,6 +84,11 @@ class Groom:
         skin = fitted.appearance.skin
         maps, head = fitted.maps, fitted.head
         return cls(strands, head, skin, maps, uv, ids, confidence, guides, clump)
+
+    def at(self, world: WorldFrame) -> Groom:
+        """The groom in the frame and unit of `world`."""
+        head = None if self.head is None else world.results(self.head)
+        return replace(self, strands=world.results(self.strands), head=head)
 
     @cached_property
     def along(self) -> Floats:

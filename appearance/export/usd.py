@@ -21,28 +21,32 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
 from appearance.export.groom import Groom
 from appearance.export.maps import SCALARS, layer_image
 from reconstruction import write_exr
-from reconstruction.arrays import AnyFloats, Array, Ints
+from reconstruction.arrays import AnyFloats, Ints
 from reconstruction.files.strands.usd import define_curves, new_stage, save_stage
+from reconstruction.geometry.world_frame import WorldFrame
 
-Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 TYPES = Sdf.ValueTypeNames
 
 
-def export_usd(groom: Groom, path: Path, *, up: Literal["Y", "Z"] = "Z") -> list[Path]:
+def export_usd(
+    groom: Groom, path: Path, *, up: Literal["Y", "Z"] = "Z", world: WorldFrame | None = None
+) -> list[Path]:
     """Write the groom in metres; returns the files: `path`, and textures beside it.
+
+    With `world`, in the user's frame and unit, which the stage's metadata state, instead of `up`.
 
     Primvars of a strand: `st`, the root's place on the scalp with v upwards from the nape,
     `strand_id`, `clump`. Of a point: `confidence`; of the material, at a point where it varies:
     `along` (0 root, 1 tip), `sigma_a`, `rotation`, `displayColor`; of all: `beta_m`, `beta_n`,
     `eta`, `tilt_deg`.
     """
-    turn = np.eye(3) if up == "Z" else Z_UP_TO_Y_UP
-    stage = new_stage(up)
+    frame = world or WorldFrame(up="z" if up == "Z" else "y")
+    stage = new_stage(frame)
     model = UsdGeom.Xform.Define(stage, "/model").GetPrim()
     stage.SetDefaultPrim(model)
     Usd.ModelAPI(model).SetKind(Kind.Tokens.component)
     UsdGeom.Scope.Define(stage, "/model/materials")
-    turned = groom.strands.transformed(turn, np.zeros(3))
+    turned = frame.results(groom.strands)
     curves = define_curves(stage, "/model/hair", turned)
     _primvars(groom, UsdGeom.PrimvarsAPI(curves))
     textures = _textures(groom, path)
@@ -53,7 +57,7 @@ def export_usd(groom: Groom, path: Path, *, up: Literal["Y", "Z"] = "Z") -> list
         api = UsdGeom.PrimvarsAPI(guides)
         _primvar(api, "strand_id", TYPES.IntArray, UsdGeom.Tokens.uniform, groom.ids[groom.guides])
     if groom.head is not None:
-        _head(groom, stage, turn)
+        _head(groom, stage, frame)
     save_stage(stage, path)
     return [path, *textures]
 
@@ -175,11 +179,11 @@ def _layers(stage: Any, textures: list[str]) -> Any:
     return found
 
 
-def _head(groom: Groom, stage: Any, turn: Array) -> None:
+def _head(groom: Groom, stage: Any, frame: WorldFrame) -> None:
     head = groom.head
     assert head is not None
     mesh = UsdGeom.Mesh.Define(stage, "/model/head")
-    points = (head.vertices @ turn.T).astype(np.float32)
+    points = frame.to_user(head.vertices).astype(np.float32)
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points)))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(head.faces), 3, np.int32)))
     indices = np.ascontiguousarray(head.faces.ravel(), np.int32)

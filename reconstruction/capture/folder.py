@@ -42,6 +42,7 @@ from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig, counted
+from reconstruction.geometry.world_frame import WorldFrame
 from reconstruction.reading import read_json
 
 T = TypeVar("T")
@@ -372,6 +373,17 @@ class Capture:
         if not path.is_file():
             return None
         return self.read_mask(path, camera)
+
+    @cached_property
+    def world(self) -> WorldFrame | None:
+        """The frame of the user's cameras, None for a capture of the stage itself."""
+        record = self.plan.get("import")
+        if not isinstance(record, dict) or "frame" not in record:
+            return None
+        try:
+            return WorldFrame.from_dict(record["frame"], "import.frame")
+        except (TypeError, ValueError) as error:
+            raise CaptureError(f"{self.path / 'plan.json'}: {error}") from error
 
     @cached_property
     def head(self) -> Mesh | None:

@@ -46,10 +46,10 @@ from reconstruction.capture.import_settings import (
     read_settings,
 )
 from reconstruction.capture.import_tables import (
-    cameras_of,
     check_metres,
     head_of,
     lights_of,
+    own_geometry,
     projectors_of,
     scalp_of,
 )
@@ -62,8 +62,9 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.placement import PlacementError, resized
+from reconstruction.geometry.placement import PlacementError, metres, resized
 from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.world_frame import WorldFrame
 from reconstruction.report.report import Progress, silent
 
 
@@ -95,7 +96,8 @@ class Import:
 
     `shot` are the cameras of the images, by name; `lenses` those of cameras whose images are
     undistorted, since a rig cannot store their lens model; `rig` is the capture's; `ball` is a grey
-    ball. All of them, `head` and `scalp` (the text of scalp.obj) are relative to `origin`.
+    ball. All of them, `head` and `scalp` (the text of scalp.obj) are relative to `origin`. Results
+    come back in the frame and unit `world` of the files.
     """
 
     folder: Path
@@ -108,6 +110,7 @@ class Import:
     ball: PlacedBall | None = None
     scalp: str | None = None
     origin: Origin = field(default_factory=Origin)
+    world: WorldFrame = field(default_factory=WorldFrame)
 
     @classmethod
     def of(
@@ -127,24 +130,28 @@ class Import:
             raise ImportProblem(f"{folder}: no such folder")
         settings = settings_of(folder) if settings is None else settings
         own = geometry is None
-        geometry = geometry or Geometry(cameras_of(folder / "cameras.json"))
+        geometry = geometry or own_geometry(folder, settings.geometry.placement)
         lights = geometry.lights or lights_of(
             folder / "lights.json", {id_: c.name for id_, c in geometry.cameras.items()}
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
-        check_metres(folder, given, "cameras" if own else "", "" if geometry.lights else "lights")
+        of_lights = "lights" if own or not geometry.lights else ""
+        check_metres(folder, given, "cameras" if own else "", of_lights)
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         found = find(folder, settings, given) if found is None else found
         alone = notes_on_plates(found, settings.pictures.clean_plate)
-        found = replace(found, notes=(*found.notes, *alone, *origin.notes))
+        doubts = geometry.notes if own else []
+        found = replace(found, notes=(*found.notes, *doubts, *alone, *origin.notes))
         cameras = {c.name: _sized(c, found) for c in given.cameras}
         lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
         lit = {s.light for s in found.steps}
         rig = replace(given, cameras=kept, lights=tuple(x for x in given.lights if x.name in lit))
-        head, scalp = head_of(folder / "head.obj"), scalp_of(folder / "scalp.obj")
+        placement = geometry.placement
+        world = WorldFrame(metres(placement.unit), placement.up or "z")
+        head, scalp = head_of(folder / "head.obj", world), scalp_of(folder / "scalp.obj", world)
         ball = None
         if settings.grey_ball is not None:
             if settings.units == "relative" or settings.scale != 1:
@@ -158,6 +165,7 @@ class Import:
         return cls(
             folder, settings, rig, cameras, lenses, found, origin.head(head), ball,
             None if scalp is None else origin.obj(scalp), origin,
+            replace(world, origin=origin.stored),
         )  # fmt: skip
 
     @property
@@ -234,8 +242,8 @@ class Import:
                 f"subject reflects {LIKELY:.0%} of the light, as brown hair and fair skin do"
             )
         lights = tuple(replace(x, intensity=factor * x.intensity) for x in self.rig.lights)
-        origin = {"origin": self.origin.point.tolist()} if self.origin.moved else {}
-        record = {"notes": notes, "relative": reader.relative, **origin}
+        frame = self.world.to_dict()
+        record = {"notes": notes, "relative": reader.relative, "frame": frame}
         plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": record}
         writer = CaptureWriter.create(
             out, replace(self.rig, lights=lights), plan,

@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from reconstruction.files.cameras import read_cameras
+from reconstruction.files.cameras.errors import CameraAxes
 from reconstruction.files.lights import LightFile, from_directions, read_lights
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -30,11 +31,15 @@ from reconstruction.options import options
 
 @dataclass(frozen=True)
 class Geometry:
-    """Cameras by their id in the file, and lights, in the world frame; `notes` for the user."""
+    """Cameras by their id in the file, and lights, in the world frame; `notes` for the user.
+
+    `placement` leads from the files' world to that frame.
+    """
 
     cameras: Mapping[str | int, Camera]
     lights: list[Light] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    placement: PlacementOptions = field(default_factory=PlacementOptions)
 
 
 @options
@@ -105,16 +110,23 @@ def read_geometry(files: GeometryFiles) -> Geometry:
             unit = files.placement.unit
             length = unit if isinstance(unit, str) else f"{unit:g} m"
             notes.append(f"{files.cameras} has no unit: {length} is assumed (--unit)")
-        try:
-            notes += check_cameras(cameras, files.placement, read.axes)
-        except PlacementError as error:
-            raise PlacementError(f"{files.cameras}: {error}") from error
+        notes += checked(files.cameras, cameras, files.placement, read.axes)
     lights: list[Light] = []
     if files.lights is not None:
         found = read_lights(files.lights)
         lights, more = _lights(files, found, cameras)
         notes += found.notes + more
-    return Geometry({c.name: c for c in cameras}, lights, notes)
+    return Geometry({c.name: c for c in cameras}, lights, notes, files.placement)
+
+
+def checked(
+    path: Path, cameras: list[Camera], placement: PlacementOptions, axes: CameraAxes
+) -> list[str]:
+    """The notes of `check_cameras`; its error names the file `path`."""
+    try:
+        return check_cameras(cameras, placement, axes)
+    except PlacementError as error:
+        raise PlacementError(f"{path}: {error}") from error
 
 
 def _two_units(path: Path | None, stated: float, option: str, given: Unit) -> str:

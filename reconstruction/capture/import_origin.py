@@ -11,10 +11,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from reconstruction.arrays import Array
+from reconstruction.capture.import_tables import obj_in_stage
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.placement import FURTHEST, NEAREST, PlacementError, Sight
 from reconstruction.geometry.rig import Rig
+from reconstruction.geometry.world_frame import FURTHEST_ORIGIN, WorldFrame
 
 NEAR = 0.1
 """Metres: distance of the subject from the origin up to which nothing is moved."""
@@ -59,6 +61,11 @@ class Origin:
         """Whether it differs from the user's."""
         return bool(self.point.any())
 
+    @property
+    def stored(self) -> Array:
+        """`point` as far as files of results can store it, else 0."""
+        return self.point if np.linalg.norm(self.point) <= FURTHEST_ORIGIN else np.zeros(3)
+
     def rig(self, rig: Rig) -> Rig:
         """`rig` relative to the new origin."""
         if not self.moved:
@@ -81,21 +88,19 @@ class Origin:
         """The text of an OBJ relative to the new origin."""
         if not self.moved:
             return text
-        return "".join(self._line(line) for line in text.splitlines(keepends=True))
-
-    def _line(self, line: str) -> str:
-        words = line.split()
-        if words[:1] != ["v"]:
-            return line
-        place = np.array(words[1:4], float) - self.point
-        return " ".join(["v", *(f"{x:.9g}" for x in place), *words[4:]]) + "\n"
+        return obj_in_stage(text, WorldFrame(origin=self.point))
 
 
 def _moved(point: Array) -> str:
     return (
         f"the cameras look at {_text(point)} m; cameras, lights, projectors, head.obj and "
-        f"scalp.obj were moved by {_text(-point)} m, so that the subject is at the origin. To "
-        f"return to your frame (metres, z up), add {_text(point)} m to the results"
+        f"scalp.obj were moved by {_text(-point)} m, so that the subject is at the origin. "
+        + (
+            "Results come back in your frame"
+            if np.linalg.norm(point) <= FURTHEST_ORIGIN
+            else "Single precision cannot store strands so far from your origin: results stay at "
+            f"the new one; add {_text(point)} m (z up)"
+        )
     )
 
 

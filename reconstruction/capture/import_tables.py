@@ -8,17 +8,32 @@ from typing import Any
 import numpy as np
 
 from reconstruction.arrays import Array
+from reconstruction.capture.import_geometry import Geometry, checked
 from reconstruction.capture.import_settings import ImportProblem
 from reconstruction.containment import is_file_name
 from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.geometry.mesh import Mesh, read_obj
-from reconstruction.geometry.placement import FURTHEST, NEAREST, PlacementError, Sight, length
+from reconstruction.geometry.placement import (
+    FURTHEST,
+    NEAREST,
+    PARALLEL,
+    PlacementError,
+    PlacementOptions,
+    Sight,
+    Unit,
+    length,
+    placed,
+    placed_lights,
+)
 from reconstruction.geometry.projectors import Projector
 from reconstruction.geometry.rig import Rig, RigError
+from reconstruction.geometry.world_frame import WorldFrame
 from reconstruction.reading import read_json
 
+INSIDE = 0.05
+"""Metres from the cameras' common target at which there is the subject and no light."""
 SMALLEST, LARGEST = 0.03, 2.5
 """Metres: extent of a part of a scalp, and of a head with its body."""
 
@@ -103,10 +118,10 @@ def cameras_of(path: Path) -> dict[str | int, Camera]:
     return out
 
 
-def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
-    """Lights; `cameras` are names by id, for `colocated_camera`."""
+def lights_of(path: Path, cameras: dict[str | int, str], length: Unit = "m") -> list[Light]:
+    """Lights in the file's unit, `length`; `cameras` are names by id, for `colocated_camera`."""
     entries, data = _entries(path, "lights")
-    for field, unit in (("position", "m"), ("intensity", "W/sr")):
+    for field, unit in (("position", length), ("intensity", "W/sr")):
         units = data.get("units", {})
         given = units.get(field, unit) if isinstance(units, dict) else units
         if given != unit:
@@ -130,6 +145,28 @@ def lights_of(path: Path, cameras: dict[str | int, str]) -> list[Light]:
     return out
 
 
+def own_geometry(folder: Path, placement: PlacementOptions) -> Geometry:
+    """The folder's cameras.json and lights.json, placed.
+
+    Without a placement they are in metres with z up, and doubts are notes. Raises `ImportProblem`
+    naming the file.
+    """
+    path, default = folder / "cameras.json", placement == PlacementOptions()
+    read = cameras_of(path)
+    names = {id_: c.name for id_, c in read.items()}
+    lights = lights_of(folder / "lights.json", names, placement.light_unit or placement.unit)
+    if not default:
+        cameras = placed(list(read.values()), placement, "opencv")
+        read, lights = dict(zip(read, cameras, strict=True)), placed_lights(lights, placement)
+    try:
+        notes = checked(path, list(read.values()), placement, "opencv")
+    except PlacementError as error:
+        if not default:
+            raise ImportProblem(str(error)) from error
+        return Geometry(read, lights, [] if str(error).endswith(PARALLEL) else [str(error)])
+    return Geometry(read, lights, [] if default else notes, placement)
+
+
 def projectors_of(path: Path) -> tuple[Projector, ...]:
     """Projectors, none without the file."""
     if not path.is_file():
@@ -147,7 +184,8 @@ def projectors_of(path: Path) -> tuple[Projector, ...]:
 def check_metres(folder: Path, rig: Rig, *own: str) -> None:
     """Raise `ImportProblem` if the folder's `own` files ("cameras", "lights") are not in metres.
 
-    That is, if the median distance from the point that the cameras look at is implausible.
+    That is, if the median distance from the point that the cameras look at is implausible. Also
+    for a light inside the subject.
     """
     try:
         sight = Sight.of(rig.cameras)
@@ -160,8 +198,16 @@ def check_metres(folder: Path, rig: Rig, *own: str) -> None:
         if sight.whole and not NEAREST <= distance <= FURTHEST:
             raise ImportProblem(
                 f"{folder / kind}.json: the {kind} are {length(distance)} from the point that the "
-                f"cameras look at, expected {NEAREST} to {FURTHEST} m: give metres with z up"
+                f"cameras look at, expected {NEAREST} to {FURTHEST} m: give --unit (mm, cm, inch "
+                "or its length in metres), or metres"
             )
+    near = [x.name for x in rig.lights if np.linalg.norm(x.position - sight.point) < INSIDE]
+    if near and sight.whole:
+        raise ImportProblem(
+            f"{folder}: {', '.join(near[:8])}: within {100 * INSIDE:g} cm of the point that the "
+            "cameras look at, inside the subject: check the lights' positions and unit "
+            "(--light-unit)"
+        )
 
 
 def _check_size(path: Path, points: Array) -> None:
@@ -174,25 +220,53 @@ def _check_size(path: Path, points: Array) -> None:
         )
 
 
-def head_of(path: Path) -> Mesh | None:
-    """The mesh of head.obj, None without the file."""
+def _in_metres(path: Path, points: Array, world: WorldFrame) -> bool:
+    """Whether `points (N, 3)` are in metres with z up rather than in the user's `world`.
+
+    They are if only then their size is a head's. Raises `ImportProblem` if it never is.
+    """
+    wide = world.unit * float(np.ptp(points, axis=0).max())
+    if SMALLEST <= wide <= LARGEST:
+        return False
+    _check_size(path, points)
+    return True
+
+
+def head_of(path: Path, world: WorldFrame) -> Mesh | None:
+    """The mesh of head.obj in metres with z up, None without the file."""
     if not path.is_file():
         return None
     try:
         head = read_obj(path)
     except ValueError as error:
         raise ImportProblem(str(error)) from error
-    _check_size(path, head.vertices)
-    return head
+    return head if _in_metres(path, head.vertices, world) else world.inputs(head)
 
 
-def scalp_of(path: Path) -> str | None:
-    """The text of a readable file of points, None without the file."""
+def scalp_of(path: Path, world: WorldFrame) -> str | None:
+    """The text of a readable file of points in metres with z up, None without the file."""
     if not path.is_file():
         return None
     try:
         points, _ = read_points(path)
     except ValueError as error:
         raise ImportProblem(str(error)) from error
-    _check_size(path, points)
-    return path.read_text()
+    text = path.read_text()
+    return text if _in_metres(path, points, world) else obj_in_stage(text, world)
+
+
+def obj_in_stage(text: str, world: WorldFrame) -> str:
+    """The text of an OBJ in the user's `world`, in the stage's frame."""
+    if world.same:
+        return text
+    turn = WorldFrame(1.0, world.up)
+    frames = {"v": world, "vn": turn}
+
+    def placed(line: str) -> str:
+        words = line.split()
+        if not words or words[0] not in frames:
+            return line
+        moved = frames[words[0]].to_stage(np.array(words[1:4], float))
+        return " ".join([words[0], *(f"{x:.9g}" for x in moved), *words[4:]]) + "\n"
+
+    return "".join(placed(line) for line in text.splitlines(keepends=True))

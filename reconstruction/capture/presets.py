@@ -130,7 +130,7 @@ def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     linear = {p.suffix.lower() for paths in taken.values() for p in paths.values()} <= {".exr"}
     frames, notes = _sequence(taken, geometry, order, mean, 0)
     return Take(
-        Geometry(_shot(geometry, taken), geometry.lights, [*geometry.notes, *notes]),
+        replace(geometry, cameras=_shot(geometry, taken), notes=[*geometry.notes, *notes]),
         frames,
         response="linear" if linear else "srgb",
     )
@@ -196,7 +196,7 @@ def _placed(cameras: CameraFile, lights: LightFile, where: PlacementOptions) -> 
     notes = [*cameras.notes, *check_cameras(stand, where, cameras.axes)]
     shine = placed_lights(lights.lights, where)
     check_lights(stand, shine, where.light_unit or where.unit)
-    return Geometry({c.name: c for c in stand}, shine, [*notes, *lights.notes])
+    return Geometry({c.name: c for c in stand}, shine, [*notes, *lights.notes], where)
 
 
 def _takes(files: PresetFiles, root: Path, example: str, deep: bool = True) -> Files:

@@ -22,6 +22,7 @@ Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 NEAREST, FURTHEST = 0.15, 8.0
 """Metres from the subject at which a stage's cameras and lights can stand."""
+PARALLEL = "the cameras' optical axes are parallel: no common target"
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -142,7 +143,7 @@ class Sight:
             across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
             A = (weight[:, None, None] * across).sum(axis=0)
             if np.linalg.cond(A) > 1e8:
-                raise PlacementError("the cameras' optical axes are parallel: no common target")
+                raise PlacementError(PARALLEL)
             point = np.linalg.solve(A, np.einsum("n,nij,nj->i", weight, across, centers))
             miss = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centers), axis=1)
             weight = 1 / np.maximum(miss, 1e-3 * np.median(miss) + 1e-12)

@@ -22,6 +22,7 @@ from reconstruction.head.lit_skin import first_depth
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
+from reconstruction.plausibility import check_subject, check_volume
 from reconstruction.report.report import Stage
 
 SHELL = 12e-3  # metres: thickness of hair under a hull's surface
@@ -89,6 +90,8 @@ def build_envelope(
         raise CaptureError(
             f"{masked.capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
+    check_subject(masked, hull, stage)
+    check_volume(masked, envelope, "the volume that can hold hair", stage)
     return envelope, depths
 
 
@@ -102,6 +105,7 @@ def build_hull(
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
     hull = envelope = masked.subject_hull(grid)
+    check_subject(masked, hull, stage)
     hair, skin = _shown(hull, masked)
     if skin.any():
         near = hair.any() and ndimage.distance_transform_edt(~hair, sampling=grid) <= SHELL
@@ -116,6 +120,7 @@ def build_hull(
         envelope_litres=float(envelope.inside.sum() * litres),
         voxels=int(envelope.inside.sum()),
     )
+    check_volume(masked, hull, "the visual hull", stage)
     stage.warn("no head: the volume under the hair counts as hair, and strands have no roots")
     depths = {
         c.name: np.where(masked.masks[c.name].hair, depth_map_first(c, envelope), 0.0)

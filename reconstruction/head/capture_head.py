@@ -14,6 +14,7 @@ from reconstruction.capture.records import CaptureError
 from reconstruction.containment import inside
 from reconstruction.files.points import read_points
 from reconstruction.geometry.mesh import Mesh, read_obj
+from reconstruction.geometry.placement import to_z_up
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head
 from reconstruction.head.generic import generic_head
@@ -70,6 +71,9 @@ def digitised_points(capture: Capture, path: str | Path | None) -> HeadPoints | 
     if path is None and not file.is_file():
         return None
     points, normals = read_points(file)
+    if path is not None and (world := capture.world) is not None:
+        points = world.to_stage(points)
+        normals = None if normals is None else normals @ to_z_up(world.up).T
     return HeadPoints(*_thinned(points, normals), HeadHints(part="scalp"), file.name)
 
 

@@ -1,7 +1,7 @@
 """Consistency of a capture's lights with its images, from small copies of the images.
 
-Two errors of imported captures are detected: light positions in other axes than the cameras, and
-a light whose position and images belong to different lights.
+Three errors of imported captures are detected: light positions in other axes than the cameras, a
+light whose position and images belong to different lights, and cameras whose images are exchanged.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from reconstruction.geometry.placement import PlacementError, Sight
 
 TILES = 12
 MOST_CAMERAS = 4
+MOST_COMPARED = 16  # cameras whose images may be exchanged
 LEAST_LIGHTS = 24
 
 
@@ -45,11 +46,50 @@ def check_scene(capture: Capture) -> list[str]:
     images, names = images[complete][:, used], [lights[k] for k in complete]
     where = np.array([capture.rig.light(n).position for n in names]) - point
     towards = np.array([c.center for c in chosen])[used] - point
-    return check_light_axes(images, where, towards) + [
+    odd = [
         f"{names[k]}: its images resemble those of lights {angle:.0f}° away; do its position and "
         "its images belong to the same light?"
         for k, angle in odd_lights(images, where).items()
     ]
+    exchanged = _exchanged(capture, cameras[:MOST_COMPARED], point)
+    return [*check_light_axes(images, where, towards), *odd, *exchanged]
+
+
+def _exchanged(capture: Capture, cameras: Sequence[Camera], point: Array) -> list[str]:
+    """`exchanged_cameras` from `2 * LEAST_LIGHTS` lights."""
+    names = capture.olat_lights()
+    names = names[:: max(1, len(names) // (2 * LEAST_LIGHTS))]
+    bright = np.stack([_tiles(capture, c, names).mean(axis=1) for c in cameras], axis=1)
+    used = np.isfinite(bright).mean(axis=0) > 0.8
+    lit = np.isfinite(bright[:, used]).all(axis=1)
+    if used.sum() < 3 or lit.sum() < LEAST_LIGHTS:
+        return []
+    kept = [c for c, there in zip(cameras, used, strict=True) if there]
+    where = np.array([capture.rig.light(n).position for n in names])[lit] - point
+    found = exchanged_cameras(
+        bright[lit][:, used], where, np.array([c.center for c in kept]) - point
+    )
+    return [
+        f"{kept[i].name}, {kept[k].name}: the light in their images fits the other one's place: "
+        "are their images or poses exchanged?"
+        for i, k in found
+    ]
+
+
+def exchanged_cameras(bright: Array, where: Array, towards: Array) -> list[tuple[int, int]]:
+    """Pairs of cameras whose brightness under lights fits each other's place.
+
+    `bright (L, C)`; `where (L, 3)` and `towards (C, 3)` are positions of lights and cameras from
+    the subject. Lights near a camera make its images brighter than those of the others.
+    """
+    places = where / np.linalg.norm(where, axis=1, keepdims=True)
+    eyes = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    shown, facing = _interaction(np.log(np.maximum(bright, 1e-12))), _interaction(places @ eyes.T)
+    shown, facing = (x / np.maximum(np.linalg.norm(x, axis=0), 1e-12) for x in (shown, facing))
+    fit = shown.T @ facing
+    gain = np.diag(fit)[:, None], np.diag(fit)[None]
+    better = (fit + fit.T - gain[0] - gain[1] > 0.6) & (np.minimum(fit, fit.T) > 0.3)
+    return [(int(i), int(k)) for i, k in np.argwhere(np.triu(better, 1))]
 
 
 def _tiles(capture: Capture, camera: Camera, lights: Sequence[str]) -> Array:

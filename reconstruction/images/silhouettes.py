@@ -15,6 +15,8 @@ NOISE_FACTOR = 5.0
 FAINTEST = 0.004  # of the subject's 95th percentile: below it is stray light
 DARKEST = 0.05  # of the 95th percentile: a mode above it is the subject
 MOST_SATURATED = 0.02
+MOST_LIGHTS = 32  # that are compared with a lit background
+LIKE_BACKGROUND = 1.5  # times its radiance
 SMALLEST = 6  # pixels: smaller specks are noise
 
 
@@ -138,10 +140,48 @@ def silhouette(capture: Capture, camera: str) -> Bools:
     if bright <= NOISE_FACTOR * noise:
         return np.zeros(image.shape, bool)
     mask = image > max(NOISE_FACTOR * noise, FAINTEST * bright)
+    mask = without_lit_background(capture, camera, mask)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     small = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] < SMALLEST]
     mask &= ~np.isin(labels, small)
     return np.asarray(_fill_pinholes(mask))
+
+
+def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
+    """The silhouette `mask (H, W)` without a lit background, which lies at the image's edges.
+
+    Unlike the subject, a background changes as one with the light: a pixel is part of it if its
+    radiance under the single lights is at most `LIKE_BACKGROUND` times the median's at the edges
+    outside of the user's hair mask, or in proportion to it up to twice that. What remains is
+    connected to the hair. The mask is returned as it is if it covers under half of the edges, if
+    they differ from each other, as those of hair that fills an image do, or if nothing is much
+    brighter.
+    """
+    edge, hair = np.ones(mask.shape, bool), capture.mask(camera)
+    edge[1:-1, 1:-1] = False
+    if hair is not None:
+        edge &= ~hair
+    steps = [s for s in capture.of_kind("olat") if capture.has(s, camera)]
+    steps = steps[:: max(1, len(steps) // MOST_LIGHTS)]
+    if len(steps) < 2 or 2 * int((mask & edge).sum()) <= int(edge.sum()):
+        return mask
+    with_edge, square, total = np.zeros((2, *mask.shape)), np.zeros(mask.shape), 0.0
+    for step in steps:
+        image = grey(dark_response(capture, step, camera)[0]).astype(float)
+        level = float(np.median(image[edge]))
+        with_edge[0] += level * image
+        square += image**2
+        total += level**2
+    ratio = np.sqrt(square / max(total, 1e-300))
+    alike = with_edge[0] / np.maximum(np.sqrt(square * total), 1e-300)
+    behind = (ratio < LIKE_BACKGROUND) | ((ratio < 2 * LIKE_BACKGROUND) & (alike > 0.97))
+    if behind[edge].mean() < 0.5 or np.quantile(ratio, 0.98) < 4 * LIKE_BACKGROUND:
+        return mask
+    kept = mask & ~behind
+    if hair is None:
+        return kept
+    labels, _ = ndimage.label(kept | hair, np.ones((3, 3)))
+    return np.asarray(kept & np.isin(labels, np.unique(labels[hair])))
 
 
 def _fill_pinholes(mask: Bools) -> Bools:

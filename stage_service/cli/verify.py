@@ -53,8 +53,8 @@ def add(commands: Commands) -> None:
         "--light-distance", type=float, help="metres; for lights given as directions"
     )
     unit = "m, cm, mm, inch, or its length in metres"
-    imported.add_argument("--unit", type=_unit, help=f"of --cameras: {unit}; default: m")
-    imported.add_argument("--light-unit", type=_unit, help=f"of --lights, if it differs: {unit}")
+    imported.add_argument("--unit", type=_unit, help=f"of the cameras: {unit}; default: m")
+    imported.add_argument("--light-unit", type=_unit, help=f"of the lights, if it differs: {unit}")
     ups = ("x", "-x", "y", "-y", "z", "-z")
     imported.add_argument("--up", choices=ups, help="axis of the files' world that points up")
     imported.add_argument(
@@ -126,6 +126,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
 
     from reconstruction.capture.import_folder import Import, settings_of
     from reconstruction.capture.import_geometry import GeometryFiles, files_in, read_geometry
+    from reconstruction.capture.import_tables import own_geometry
     from reconstruction.capture.presets import PresetFiles, mean_light, read_preset, understood
     from reconstruction.geometry.placement import PlacementOptions
     from reconstruction.options import parse_options
@@ -155,17 +156,17 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     placement = {f: v for f, v in vars(configured.placement).items() if v is not None}
     named = {**vars(configured), **options, "placement": {**placement, **given}}
     files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
-    geometry = read_geometry(files) if files.cameras or files.lights else None
-    if geometry is None and files != GeometryFiles():
-        raise BadArgument(
-            "units, light distance, up and camera axes need --cameras; cameras.json and "
-            "lights.json are in metres, z up, with OpenCV's axes"
-        )
+    if files.light_distance is not None and files.lights is None:
+        raise BadArgument("--light-distance needs --lights; lights.json has positions")
+    if files.cameras or files.lights:
+        geometry = read_geometry(files)
+    else:
+        geometry = own_geometry(args.folder, files.placement)
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)
         settings = replace(settings, pictures=patterns)
     imported = Import.of(args.folder, geometry, settings)
-    return imported, [*(geometry.notes if geometry else []), *imported.found.notes]
+    return imported, [*geometry.notes, *imported.found.notes]
 
 
 def _unit(text: str) -> str | float:

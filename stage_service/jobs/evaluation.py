@@ -37,7 +37,7 @@ def evaluate_geometry(
     from reconstruction.evaluation.matching import compare_strands
     from reconstruction.evaluation.visibility import Visibility
 
-    true = read_strands(truth)
+    true = read_strands(truth, frame=model.frame)
     cameras, head = capture.rig.cameras, model.head(capture)
     progress("what the cameras see of the true strands", 0.0)
     visibility = Visibility(cameras, true, head)

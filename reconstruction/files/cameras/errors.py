@@ -58,7 +58,10 @@ def camera_names(pictures: Sequence[str], where: str) -> list[str]:
                     raise CameraFileError(f"{where}: {name!r} is not a valid name")
             return names
     twice = Counter(str(p) for p in paths).most_common(1)[0][0] if paths else ""
-    raise CameraFileError(f"{where}: image names do not identify cameras: {twice} occurs twice")
+    raise CameraFileError(
+        f"{where}: image names do not identify cameras: {twice} occurs twice: give each camera a "
+        "name or a folder of its own"
+    )
 
 
 def pinhole_K(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:

@@ -24,6 +24,7 @@ from reconstruction.files.strands.photobooth import read_data
 from reconstruction.files.strands.ply import read_ply_strands
 from reconstruction.files.strands.tressfx import read_tfx
 from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.world_frame import WorldFrame
 
 __all__ = [
     "READABLE",
@@ -43,10 +44,10 @@ def _read_usd(path: Path) -> Strands:
     return read_usd(path)
 
 
-def _write_usd(path: Path, strands: Strands) -> None:
+def _write_usd(path: Path, strands: Strands, frame: WorldFrame | None = None) -> None:
     from reconstruction.files.strands.usd import write_usd
 
-    write_usd(path, strands)
+    write_usd(path, strands, frame)
 
 
 _READERS: dict[str, Callable[[Path], Strands]] = {
@@ -65,11 +66,14 @@ WRITABLE = tuple(_WRITERS)
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
+def read_strands(
+    path: str | Path, up_axis: Literal["z", "y"] = "z", frame: WorldFrame | None = None
+) -> Strands:
     """Read strands from a file of any of the formats `READABLE`, root first.
 
     USD is converted to metres with z up, whatever `up_axis` is. Other formats are read as metres;
-    `up_axis="y"` converts y up to z up, (x, y, z) to (x, -z, y).
+    `up_axis="y"` converts y up to z up, (x, y, z) to (x, -z, y). Strands in the user's `frame` are
+    converted to the stage's.
 
     Raises `StrandFileError` (a `ValueError`) naming the file and the error.
     """
@@ -88,32 +92,37 @@ def read_strands(path: str | Path, up_axis: Literal["z", "y"] = "z") -> Strands:
         strands = reader(path)
     except (ValueError, TypeError, OverflowError) as error:
         raise StrandFileError(f"{path}: {error}") from error
+    if frame is not None:
+        return (frame.as_read_from_usd if reader is _read_usd else frame).inputs(strands)
     if up_axis == "y" and reader is not _read_usd:
         return strands.transformed(_Y_UP_TO_Z_UP, np.zeros(3))
     return strands
 
 
-def read_poses(path: str | Path) -> list[Strands]:
+def read_poses(path: str | Path, frame: WorldFrame | None = None) -> list[Strands]:
     """Read animated strands: an `.npz` of points (T, N, 3), or one pose of any other file.
 
-    Raises `StrandFileError` as `read_strands` does.
+    Poses in the user's `frame` are converted to the stage's. Raises `StrandFileError` as
+    `read_strands` does.
     """
     path = Path(path)
     if path.suffix.lower() != ".npz":
-        return [read_strands(path)]
+        return [read_strands(path, frame=frame)]
     if not path.is_file():
         raise StrandFileError(f"{path}: no such file")
     try:
-        return read_npz_poses(path)
+        poses = read_npz_poses(path)
     except (ValueError, TypeError, OverflowError) as error:
         raise StrandFileError(f"{path}: {error}") from error
+    return poses if frame is None else [frame.inputs(pose) for pose in poses]
 
 
-def write_strands(path: str | Path, strands: Strands) -> None:
+def write_strands(path: str | Path, strands: Strands, frame: WorldFrame | None = None) -> None:
     """Write strands in the format that the suffix names (one of `WRITABLE`), in metres, z up.
 
-    Alembic is y up, by custom, and needs the extra `alembic`. Writes are atomic. Raises
-    `StrandFileError` for an unknown format or strands that it cannot store.
+    Alembic is y up, by custom, and needs the extra `alembic`. With `frame`, strands of the stage
+    are written in the user's frame and unit, whatever the format; USD states both. Writes are
+    atomic. Raises `StrandFileError` for an unknown format or strands that it cannot store.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
@@ -121,4 +130,11 @@ def write_strands(path: str | Path, strands: Strands) -> None:
         raise StrandFileError(
             f"{path}: cannot write the format {path.suffix!r}; writable are {', '.join(WRITABLE)}"
         )
-    writer(path, strands)
+    if frame is None:
+        writer(path, strands)
+    elif writer is _write_usd:
+        _write_usd(path, frame.results(strands), frame)
+    elif writer is write_abc:
+        write_abc(path, frame.results(strands), turned=False)
+    else:
+        writer(path, frame.results(strands))

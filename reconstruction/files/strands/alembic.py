@@ -20,13 +20,14 @@ from reconstruction.geometry.strands import Strands
 _Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def write_abc(path: Path, strands: Strands) -> None:
-    """Write one set of linear curves, `/hair`, y up; widths are twice the radius.
+def write_abc(path: Path, strands: Strands, *, turned: bool = True) -> None:
+    """Write one set of linear curves, `/hair`; widths are twice the radius.
 
-    Raises `StrandFileError` if the extra is not installed.
+    `turned` converts z up to y up. Raises `StrandFileError` if the extra is not installed.
     """
-    turned = strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3))
-    write_archive(path, 20 * len(strands.points), lambda top: add_curves(top, "hair", turned))
+    if turned:
+        strands = strands.transformed(_Z_UP_TO_Y_UP, np.zeros(3))
+    write_archive(path, 20 * len(strands.points), lambda top: add_curves(top, "hair", strands))
 
 
 def write_archive(path: Path, needed: int, fill: Callable[[Any], Any]) -> None:

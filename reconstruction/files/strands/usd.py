@@ -19,6 +19,7 @@ from reconstruction.files.durable import writing
 from reconstruction.files.strands.curves import TO_BEZIER, on_curve, segment_counts
 from reconstruction.files.strands.errors import StrandFileError, radii
 from reconstruction.geometry.strands import Strands
+from reconstruction.geometry.world_frame import WorldFrame
 
 _START = Usd.TimeCode.EarliestTime()
 """The first time sample, or the only value: many programs write time samples only."""
@@ -119,18 +120,21 @@ def _widths(curves: Any) -> tuple[Array, str | None]:
     return np.asarray(values or [], np.float64), str(interpolation)
 
 
-def write_usd(path: Path, strands: Strands) -> None:
-    """Write one linear `BasisCurves` prim, `/hair`, the stage's default prim."""
-    stage = new_stage(UsdGeom.Tokens.z)
+def write_usd(path: Path, strands: Strands, frame: WorldFrame | None = None) -> None:
+    """Write one linear `BasisCurves` prim, `/hair`, the stage's default prim.
+
+    The strands are in metres with z up, or in the unit and axes of `frame`.
+    """
+    stage = new_stage(frame or WorldFrame())
     stage.SetDefaultPrim(define_curves(stage, "/hair", strands).GetPrim())
     save_stage(stage, path)
 
 
-def new_stage(up: Any) -> Any:
-    """An empty stage in metres with up axis `up`, "Y" or "Z"."""
+def new_stage(frame: WorldFrame) -> Any:
+    """An empty stage with the unit and up axis of `frame`; z for an axis that USD cannot state."""
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, up)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, frame.usd_up.upper())
+    UsdGeom.SetStageMetersPerUnit(stage, frame.unit)
     return stage
 
 

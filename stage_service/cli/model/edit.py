@@ -87,7 +87,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     source = Model(args.model)
     fitted = FittedModel.load(source, Capture(args.capture) if args.capture else None)
     if args.strands is not None:
-        before, fitted = fitted, restyled(fitted, read_strands(args.strands))
+        before, fitted = fitted, restyled(fitted, read_strands(args.strands, frame=source.frame))
         distance, _ = cKDTree(before.strands.roots).query(fitted.strands.roots)
         off = float(np.median(distance))
         if off > OFF:
@@ -103,6 +103,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     if args.roughen is not None:
         fitted = fitted.with_maps(roughened(fitted.maps, args.roughen))
     model = Model(args.out)
+    model.create().start(source.frame)
     fitted.save(model)
     if source.has("scalp_map.npz"):
         roots = fitted.root_uv.astype(np.float32)

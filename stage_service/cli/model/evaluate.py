@@ -11,6 +11,7 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
+    add_frame,
     add_group,
     progress_bar,
 )
@@ -24,6 +25,7 @@ def add(commands: Commands) -> None:
     geometry.add_argument("true", type=Path, help="strand file")
     geometry.add_argument("--capture", type=Path, help="capture, for its cameras and head")
     geometry.add_argument("--head", type=Path, help="head mesh (OBJ), instead of the capture's")
+    add_frame(geometry)
     geometry.add_argument("--out", type=Path, help="folder for report.json and pictures")
     geometry.add_argument("--seed", type=int, default=0)
 
@@ -31,12 +33,12 @@ def add(commands: Commands) -> None:
 def run_geometry(args: argparse.Namespace, output: Output) -> None:
     """Precision, recall and F of strands against true ones.
 
-    Compare two strand files (metres, z up, roots first) at 1 mm/10°, 2 mm/20° and 3 mm/30°: over
-    all true points, and with --capture over the visible ones; with and without the direction from
-    root to tip; with lengths and continuity. With --capture also the scores with the
-    true directions over a pixel.
+    Compare two strand files (metres, z up, roots first; of an imported capture, in the frame and
+    unit of its cameras) at 1 mm/10°, 2 mm/20° and 3 mm/30°: over all true points, and with
+    --capture over the visible ones; with and without the direction from root to tip; with lengths
+    and continuity. With --capture also the scores with the true directions over a pixel.
     """
-    from reconstruction import Capture, read_obj, read_strands
+    from reconstruction import Capture, Model, read_obj, read_strands
     from reconstruction.evaluation.assessment import assess_strands, input_warnings
     from stage_service.cli.support.tables import assessment_text
 
@@ -47,11 +49,15 @@ def run_geometry(args: argparse.Namespace, output: Output) -> None:
             f"--out {args.out} is a model or a capture, whose report.json would be replaced: "
             "choose another folder"
         )
-    pred, true = read_strands(args.pred), read_strands(args.true)
+    capture = Capture(args.capture) if args.capture is not None else None
+    world = Model(args.pred.parent).frame if capture is None else capture.world
+    world = None if args.frame == "stage" else world
+    pred, true = (read_strands(path, frame=world) for path in (args.pred, args.true))
     if not len(true):
         raise BadArgument(f"{args.true}: no strands to compare with")
-    capture = Capture(args.capture) if args.capture is not None else None
     head = capture.head if capture is not None else None
+    if args.head is not None:
+        head = read_obj(args.head) if world is None else world.inputs(read_obj(args.head))
     early = input_warnings(pred, true)
     for warning in early:  # before the work: strands in millimetres take long
         output.note(f"warning: {warning}")
@@ -60,7 +66,7 @@ def run_geometry(args: argparse.Namespace, output: Output) -> None:
             pred,
             true,
             cameras=capture.rig.cameras if capture is not None else None,
-            head=read_obj(args.head) if args.head is not None else head,
+            head=head,
             seed=args.seed,
             progress=progress,
         )

@@ -6,12 +6,19 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
+from stage_service.cli.support.commands import (
+    BadArgument,
+    Commands,
+    Output,
+    add_command,
+    add_frame,
+)
 
 if TYPE_CHECKING:
     from appearance.export.groom import Groom
     from appearance.export.options import ExportOptions
     from reconstruction import Capture
+    from reconstruction.geometry.world_frame import WorldFrame
 
 USD = (".usd", ".usda", ".usdc")
 SUFFIXES = {
@@ -54,6 +61,7 @@ def add(commands: Commands) -> None:
     export.add_argument(
         "--cards", type=int, help="hair cards of gltf's finest level (default: 600)"
     )
+    add_frame(export)
     export.add_argument("--seed", type=int, default=0)
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
     export.add_argument(
@@ -69,7 +77,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     Curves with Principled Hair; unreal: Alembic in centimetres with groom_ attributes; gltf: hair
     cards in three levels of detail; mitsuba: a folder with a scene for stock Mitsuba 3; maps: an
     OpenEXR file for each layer of the hair maps; abc, hair: the strands alone, as Alembic and
-    cyHair.
+    cyHair. Results of imported captures come in the user's world: usd, abc and hair in the unit and
+    axes of the cameras' files, the others in their own.
     """
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
@@ -99,14 +108,12 @@ def run(args: argparse.Namespace, output: Output) -> None:
     given = {n: value for n, value in given.items() if value is not None}
     options = parse_options(ExportOptions, given, "export")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
-    moved = capture.plan.get("import", {}).get("origin") if capture is not None else None
-    if moved is not None:
-        by = ", ".join(f"{x:g}" for x in moved)
-        output.note(f"the import moved the capture: add ({by}) m for the original coordinates")
+    world = model.frame or (None if capture is None else capture.world)
+    world = None if args.frame == "stage" else world
     if args.to in STRANDS:
         strands, _ = thinned(model.strands(), options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_strands(out, strands)
+        write_strands(out, strands, world)
         files = [out]
     else:
         groom = Groom.load(model, capture, options)
@@ -119,7 +126,10 @@ def run(args: argparse.Namespace, output: Output) -> None:
             output.note(f"warning: exports do not contain the reflectance field of {model}")
         if groom.head is None and args.to != "maps":
             output.note(f"warning: {model} has no head: give the capture that has one (--capture)")
-        files = _write(args, output, groom, capture, options)
+        files = _write(args, output, groom, capture, options, world)
+    if world is not None and args.to != "maps":
+        raw = args.to == "usd" or args.to in STRANDS
+        output.note(f"in the frame of the cameras' files: {(world if raw else world.in_metres)}")
     output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
 
 
@@ -129,14 +139,20 @@ def _write(
     groom: Groom,
     capture: Capture | None,
     options: ExportOptions,
+    world: WorldFrame | None,
 ) -> list[Path]:
     """Write the file or folder; returns the paths."""
     out: Path = args.out
     out.parent.mkdir(parents=True, exist_ok=True)
-    if args.to in ("usd", "houdini"):
+    if args.to == "usd":
         from appearance.export.usd import export_usd
 
-        return export_usd(groom, out, up="Z" if args.to == "usd" else "Y")
+        return export_usd(groom, out, world=world)
+    groom = groom if world is None else groom.at(world.in_metres)
+    if args.to == "houdini":
+        from appearance.export.usd import export_usd
+
+        return export_usd(groom, out, up="Y")
     if args.to == "blender":
         from appearance.export.blender import export_blender
 
@@ -156,6 +172,8 @@ def _write(
         from appearance.export.maps import export_maps
 
         return export_maps(groom.maps, out)
+    import numpy as np
+
     from appearance.export.mitsuba import View, export_mitsuba, off_by
     from appearance.model.relight import three_quarter_view
     from appearance.render.environment_maps import environment_map
@@ -164,6 +182,7 @@ def _write(
         camera = three_quarter_view(groom.strands, SIZE)
     else:
         camera = capture.rig.camera(args.camera)
+        camera = camera if world is None else camera.moved(np.eye(3), -world.origin)
         if (off := off_by(camera)) > OFF:
             output.note(
                 f"warning: {camera.name} has lens distortion or non-square pixels, which Mitsuba's "

@@ -14,6 +14,7 @@ from stage_service.cli.support.commands import (
     Commands,
     Output,
     add_command,
+    add_frame,
     add_view,
     progress_bar,
     read_json,
@@ -39,6 +40,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="only estimate seconds, memory and disk on this machine",
     )
+    add_frame(reconstruct)
     reconstruct.add_argument("--options", help="the method's options as JSON")
     add_view(reconstruct)
 
@@ -63,7 +65,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
         "reduced": args.reduce,
-        "reconstruct": read_json(args.options),
+        "reconstruct": {"frame": args.frame, **read_json(args.options)},
     }
     options, capture = parse_options(JobOptions, given), Capture(args.capture)
     if args.estimate:

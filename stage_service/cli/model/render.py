@@ -126,7 +126,9 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError("--camera and --light need the rig: give --capture")
     if capture is None and args.field == "interpolation":
         raise ValueError("--field interpolation needs captured frames: give --capture")
-    poses: list[Strands] = [] if args.strands is None else read_poses(args.strands)
+    poses: list[Strands] = (
+        [] if args.strands is None else read_poses(args.strands, Model(args.model).frame)
+    )
     moves = args.turntable or args.turning_light or len(poses) > 1
     _check_animation(args, len(poses), moves)
     if args.out is not None:

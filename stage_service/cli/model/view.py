@@ -6,7 +6,13 @@ import argparse
 from pathlib import Path
 from urllib.parse import quote
 
-from stage_service.cli.support.commands import BadArgument, Commands, Output, add_command
+from stage_service.cli.support.commands import (
+    BadArgument,
+    Commands,
+    Output,
+    add_command,
+    add_frame,
+)
 
 
 def add(commands: Commands) -> None:
@@ -17,6 +23,7 @@ def add(commands: Commands) -> None:
     view.add_argument(
         "--truth", type=Path, help="a strand file to compare the model's strands with"
     )
+    add_frame(view)
     view.add_argument("--port", type=int, default=0, help="0 takes any free port")
 
 
@@ -44,7 +51,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
             "or 'hairstage demo'"
         )
     capture = None if args.capture is None else Capture(args.capture)
-    truth = None if args.truth is None else read_strands(args.truth)
+    world = None if args.frame == "stage" else model.frame
+    truth = None if args.truth is None else read_strands(args.truth, frame=world)
     name = args.model.resolve().name
     decoder = Decoder()
     viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth), decoder)

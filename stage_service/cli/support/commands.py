@@ -180,6 +180,16 @@ def _phrase(sentence: str) -> str:
     return text if text[1:2].isupper() else text[0].lower() + text[1:]
 
 
+def add_frame(parser: argparse.ArgumentParser) -> None:
+    """Add `--frame`."""
+    parser.add_argument(
+        "--frame",
+        choices=("user", "stage"),
+        default="user",
+        help="of an imported capture: that of the user's cameras (default), or the stage's",
+    )
+
+
 def add_view(parser: argparse.ArgumentParser) -> None:
     """Add the view of a capture: `--hold-out-camera`, `--hold-out-light`, `--reduce`."""
     for kind in ("camera", "light"):
@@ -237,7 +247,12 @@ def in_url(name: str) -> str:
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     """Run the command that `argv` names; returns its exit code (see `EXIT_CODES`)."""
-    args = parser.parse_args(argv)
+    given = sys.argv[1:] if argv is None else list(argv)
+    for k in range(len(given) - 1):  # argparse takes "-y" for an option
+        if given[k] == "--up" and given[k + 1] in ("-x", "-y", "-z"):
+            given[k : k + 2] = [f"--up={given[k + 1]}"]
+            break
+    args = parser.parse_args(given)
     output = Output(as_json=args.json)
     debug = getattr(args, "debug", False)
     try:

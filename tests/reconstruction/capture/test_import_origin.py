@@ -77,8 +77,9 @@ def test_a_subject_that_is_elsewhere_is_moved_to_the_origin(tmp_path: Path) -> N
     still = import_folder(folder(tmp_path / "still", [0, 0, 0]), tmp_path / "a")
     away = import_folder(folder(tmp_path / "away", AWAY.tolist()), tmp_path / "b")
     assert_same(still, away)
-    assert still.plan["import"] == {"notes": [], "relative": False}
-    assert away.plan["import"]["origin"] == AWAY.tolist()
+    frame = {"unit": 1.0, "up": "z", "origin": [0.0, 0.0, 0.0]}
+    assert still.plan["import"] == {"notes": [], "relative": False, "frame": frame}
+    assert away.plan["import"]["frame"] == {**frame, "origin": AWAY.tolist()}
     (note,) = away.plan["import"]["notes"]
     assert "the cameras look at (0.300, -0.200, 1.600) m" in note
     assert "were moved by (-0.300, 0.200, -1.600) m" in note
@@ -87,7 +88,8 @@ def test_a_subject_that_is_elsewhere_is_moved_to_the_origin(tmp_path: Path) -> N
 def test_a_subject_near_the_origin_stays_where_it_is(tmp_path: Path) -> None:
     at = [0.05, -0.04, 0.06]
     capture = import_folder(folder(tmp_path / "near", at), tmp_path / "out")
-    assert capture.plan["import"] == {"notes": [], "relative": False}
+    assert capture.world is not None
+    assert capture.world.same
     for camera, given in zip(capture.rig.cameras, cameras(at), strict=True):
         assert camera.t.tolist() == given.t.tolist()
     text = (tmp_path / "out" / "scalp.obj").read_bytes()

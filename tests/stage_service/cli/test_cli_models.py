@@ -315,7 +315,7 @@ def test_exports_warn_about_omitted_data(made, capsys, tmp_path, monkeypatch):
     model = Model(shutil.copytree(made.model.path, tmp_path / "model"))
     capture = shutil.copytree(made.capture, tmp_path / "moved")
     plan = json.loads((capture / "plan.json").read_text())
-    plan["import"] = {"notes": [], "origin": [0.5, -2.0, 1.25]}
+    plan["import"] = {"notes": [], "frame": {"unit": 1e-3, "origin": [0.5, -2.0, 1.25]}}
     (capture / "plan.json").write_text(json.dumps(plan))
     words = ["export", str(model), "--to", "maps", "--out", str(tmp_path / "maps")]
     assert main([*words, "--capture", str(capture)]) == 0
