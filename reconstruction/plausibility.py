@@ -14,6 +14,7 @@ from scipy import ndimage
 from reconstruction.arrays import Bools
 from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.mesh import Mesh
+from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.masks import MaskedCapture
@@ -60,15 +61,18 @@ def check_volume(masked: MaskedCapture, hull: VoxelGrid, what: str, stage: Stage
         stage.warn(f"{said}: if it is no patch or tuft of hair, {WAYS}")
 
 
-def check_subject(masked: MaskedCapture, hull: VoxelGrid, stage: Stage) -> None:
-    """Hold the subject's `hull` against the rig and the masks; warn or raise `CaptureError`."""
-    rig = masked.capture.rig
+def check_places(rig: Rig, hull: VoxelGrid) -> None:
+    """Raise `CaptureError` for a camera or light of `rig` inside the subject's `hull`."""
     places = {c.name: c.center for c in rig.cameras} | {x.name: x.position for x in rig.lights}
     if inside := [name for name, place in places.items() if hull.contains(place)]:
         raise CaptureError(
             f"{', '.join(inside[:8])}: inside the subject, where no camera and no light can be: "
             "check positions, unit (--unit, --light-unit) and axes"
         )
+
+
+def check_subject(masked: MaskedCapture, hull: VoxelGrid, stage: Stage) -> None:
+    """Hold the whole subject's `hull` against the masks; warn or raise `CaptureError`."""
     parts, count = ndimage.label(hull.inside)
     sizes = np.sort(np.bincount(parts.ravel(), minlength=count + 1)[1:])[::-1]
     litres = 1e3 * hull.spacing**3 * sizes

@@ -42,7 +42,7 @@ class WorldFrame:
         return {"unit": self.unit, "up": self.up, "origin": self.origin.tolist()}
 
     def __str__(self) -> str:
-        at = ", ".join(f"{x:g}" for x in -self.to_stage(np.zeros((1, 3)))[0])
+        at = ", ".join(f"{x:g}" for x in self.origin)
         return f"{self.up} up, unit {self.unit:g} m, the stage's origin at ({at}) m (z up)"
 
     @property

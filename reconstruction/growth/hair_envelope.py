@@ -22,7 +22,7 @@ from reconstruction.head.lit_skin import first_depth
 from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
-from reconstruction.plausibility import check_subject, check_volume
+from reconstruction.plausibility import check_places, check_subject, check_volume
 from reconstruction.report.report import Stage
 
 SHELL = 12e-3  # metres: thickness of hair under a hull's surface
@@ -90,7 +90,7 @@ def build_envelope(
         raise CaptureError(
             f"{masked.capture.path}: no volume is left for hair: check masks, head.obj and poses"
         )
-    check_subject(masked, hull, stage)
+    check_places(masked.capture.rig, hull)
     check_volume(masked, envelope, "the volume that can hold hair", stage)
     return envelope, depths
 
@@ -105,6 +105,7 @@ def build_hull(
     Raises `CaptureError` where nothing is left, or too few cameras see hair.
     """
     hull = envelope = masked.subject_hull(grid)
+    check_places(masked.capture.rig, hull)
     check_subject(masked, hull, stage)
     hair, skin = _shown(hull, masked)
     if skin.any():

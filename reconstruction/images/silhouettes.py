@@ -175,7 +175,7 @@ def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
     ratio = np.sqrt(square / max(total, 1e-300))
     alike = with_edge[0] / np.maximum(np.sqrt(square * total), 1e-300)
     behind = (ratio < LIKE_BACKGROUND) | ((ratio < 2 * LIKE_BACKGROUND) & (alike > 0.97))
-    if behind[edge].mean() < 0.5 or np.quantile(ratio, 0.98) < 4 * LIKE_BACKGROUND:
+    if behind[edge].mean() < 0.5 or np.quantile(ratio, 0.98) < 2.5 * LIKE_BACKGROUND:
         return mask
     kept = mask & ~behind
     if hair is None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reconstruction import Camera, Strands, read_strands
+from reconstruction import Camera, Model, Strands, read_strands
 from reconstruction.geometry.lights import dome_positions
 
 README = Path(__file__).parents[2] / "README.md"
@@ -130,7 +130,9 @@ def test_three_commands_lead_from_photographs_to_strands_in_blender(photographs,
     options = json.dumps({"grid": 5e-3, "within": 4e-3})
     said = typed(second, "--options", options, cwd=tmp_path)
     assert "no sweep, 64 single lights, no head: method hull" in said
-    strands = read_strands(tmp_path / "model" / "strands.npz")
+    given = read_strands(tmp_path / "model" / "strands.npz").points / MM  # as COLMAP's numbers
+    strands = Model(tmp_path / "model").strands()
+    np.testing.assert_allclose(given, strands.points, atol=1e-6)
     distance = np.linalg.norm(strands.points, axis=1)
     assert len(strands) > 100
     # the surface, and what is filled under it

@@ -317,10 +317,13 @@ def test_exports_warn_about_omitted_data(made, capsys, tmp_path, monkeypatch):
     plan = json.loads((capture / "plan.json").read_text())
     plan["import"] = {"notes": [], "frame": {"unit": 1e-3, "origin": [0.5, -2.0, 1.25]}}
     (capture / "plan.json").write_text(json.dumps(plan))
+    hair = ["export", str(model), "--to", "hair", "--out", str(tmp_path / "moved.hair")]
+    assert main([*hair, "--capture", str(capture)]) == 0
+    said = capsys.readouterr().err
+    assert "z up, unit 0.001 m, the stage's origin at (0.5, -2, 1.25) m" in said
     words = ["export", str(model), "--to", "maps", "--out", str(tmp_path / "maps")]
     assert main([*words, "--capture", str(capture)]) == 0
     said = capsys.readouterr().err
-    assert "add (0.5, -2, 1.25) m" in said
     assert "field" not in said
     model.file("field.npz").write_bytes(b"")
     monkeypatch.setattr(Field, "load", lambda _: None)
