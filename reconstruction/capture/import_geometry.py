@@ -97,20 +97,20 @@ def read_geometry(files: GeometryFiles) -> Geometry:
         raise PlacementError(
             "--lights requires --cameras; with cameras.json the lights are read from lights.json"
         )
-    if files.cameras is not None:
-        read = read_cameras(files.cameras)
+    if (path := files.cameras) is not None:
+        read = read_cameras(path)
         if read.metres is not None and metres(files.placement.unit) != read.metres:
             if files.placement.unit == "m":
                 files = replace(files, placement=replace(files.placement, unit=read.metres))
             else:
-                notes.append(_two_units(files.cameras, read.metres, "--unit", files.placement.unit))
+                notes.append(_two_units(path, read.metres, "--unit", files.placement.unit))
         cameras = placed(read.cameras, files.placement, read.axes)
         notes += read.notes
         if read.unitless:
             unit = files.placement.unit
             length = unit if isinstance(unit, str) else f"{unit:g} m"
-            notes.append(f"{files.cameras} has no unit: {length} is assumed (--unit)")
-        notes += checked(files.cameras, cameras, files.placement, read.axes)
+            notes.append(f"{path} has no unit: {length} is assumed (--unit)")
+        notes += checked(path, cameras, files.placement, read.axes)
     lights: list[Light] = []
     if files.lights is not None:
         found = read_lights(files.lights)
