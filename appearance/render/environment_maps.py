@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from reconstruction import read_exr
 from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.files.radiance import read_hdr
 
 BRIGHTEST = 1e25
 """Radiance, or a light's intensity, up to which sums over paths stay finite in float32."""
@@ -29,10 +29,7 @@ def load_environment(path: str | Path, kind: str | None = None) -> Floats:
         return check_environment(read_exr(path)[0], str(path))
     if kind != "hdr":
         raise ValueError(f"{path}: an environment map must be .hdr or .exr")
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 3 or image.dtype != np.float32:
-        raise ValueError(f"{path}: cannot be read as a Radiance .hdr image")
-    return check_environment(np.ascontiguousarray(image[:, :, 2::-1]), str(path))
+    return check_environment(read_hdr(path), str(path))
 
 
 def check_environment(envmap: AnyFloats, name: str) -> Floats:

@@ -57,7 +57,8 @@ from reconstruction.capture.likely_lights import LIKELY
 from reconstruction.capture.records import Step
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
-from reconstruction.files.pictures import PictureError, picture_size
+from reconstruction.files.encoded import PictureError
+from reconstruction.files.pictures import picture_size
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.lens_models import LensModelCamera
@@ -304,7 +305,7 @@ def _sized(camera: Camera, found: Found) -> Camera:
         if name == camera.name:
             path = next(iter(bracket.values()))
             try:
-                return resized(camera, *picture_size(path))
+                return resized(camera, *picture_size(path, (camera.width, camera.height)))
             except PlacementError as error:
                 raise ImportProblem(f"{path}: {error}") from error
             except PictureError as error:

@@ -8,7 +8,6 @@ from functools import cached_property
 from itertools import product
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
@@ -17,8 +16,9 @@ from reconstruction.capture.grey_ball import PlacedBall, Scale
 from reconstruction.capture.import_settings import Bracket, Found, ImportProblem, ImportSettings
 from reconstruction.capture.likely_lights import likely_strength
 from reconstruction.capture.records import Step
-from reconstruction.files.masks import AS_STORED, check_alpha, half_grey
-from reconstruction.files.pictures import PictureError, picture_size, read_picture
+from reconstruction.files.encoded import PictureError
+from reconstruction.files.masks import read_mask
+from reconstruction.files.pictures import Picture, read_picture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rig import Rig
 from reconstruction.report.report import Progress, silent
@@ -57,13 +57,16 @@ class ImportedFrames:
         return self._merged(bracket, camera, self._scale.value)
 
     def _merged(self, bracket: Bracket, camera: str, scale: float) -> Merged:
-        size = (self.shot[camera].width, self.shot[camera].height)
+        merged = merge({s: self._picture(p, camera) for s, p in bracket.items()}, scale)
+        return flattened(merged, self._flats[camera]) if camera in self._flats else merged
+
+    def _picture(self, path: Path, camera: str) -> Picture:
+        shot = self.shot[camera]
+        aspect = float(shot.K[1, 1] / shot.K[0, 0])
         try:
-            pictures = {s: read_picture(p, self.settings.sensor, size) for s, p in bracket.items()}
+            return read_picture(path, self.settings.sensor, (shot.width, shot.height), aspect)
         except PictureError as error:
             raise ImportProblem(str(error)) from error
-        merged = merge(pictures, scale)
-        return flattened(merged, self._flats[camera]) if camera in self._flats else merged
 
     @cached_property
     def _scale(self) -> Scale:
@@ -118,11 +121,7 @@ class ImportedFrames:
     def _flats(self) -> Mapping[str, Floats]:
         out = {}
         for camera, path in self.found.flats.items():
-            size = (self.shot[camera].width, self.shot[camera].height)
-            try:
-                picture = read_picture(path, self.settings.sensor, size)
-            except PictureError as error:
-                raise ImportProblem(str(error)) from error
+            picture = self._picture(path, camera)
             light, full = picture.light, float(picture.saturated.mean())
             if full > FLAT_FULL:
                 raise ImportProblem(
@@ -179,18 +178,7 @@ def notes_on_plates(found: Found, pattern: str | None) -> list[str]:
 
 def read_user_mask(path: Path, camera: Camera) -> Bools:
     """A mask `(H, W)` in the pixels of the images, half grey and above. Raises `ImportProblem`."""
-    expected = (camera.width, camera.height)
     try:
-        found = picture_size(path)
-    except PictureError as error:
+        return read_mask(path, camera.width, camera.height)
+    except (ValueError, OSError) as error:
         raise ImportProblem(str(error)) from error
-    how = AS_STORED | cv2.IMREAD_GRAYSCALE
-    image = cv2.imread(str(path), how) if found == expected else None
-    if image is None:
-        raise ImportProblem(f"{path}: expected a PNG of {expected} pixels, got {found}")
-    try:
-        mask = half_grey(np.asarray(image, np.uint8))
-        check_alpha(path.read_bytes(), mask)
-        return mask
-    except ValueError as error:
-        raise ImportProblem(f"{path}: {error}") from error

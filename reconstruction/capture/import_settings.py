@@ -14,14 +14,8 @@ from typing import Any, Literal, get_args
 from reconstruction.capture.grey_ball import GreyBall
 from reconstruction.capture.import_geometry import GeometryFiles
 from reconstruction.capture.records import CaptureError, Step, StepKind
-from reconstruction.files.pictures import (
-    FORMATS,
-    LOSSY,
-    PictureError,
-    Positive,
-    Sensor,
-    exposure_of,
-)
+from reconstruction.files.encoded import FORMATS, PictureError
+from reconstruction.files.pictures import LOSSY, Positive, Sensor, exposure_of
 from reconstruction.geometry.rig import Rig
 from reconstruction.options import BadOptions, options, parse_options
 

@@ -7,49 +7,160 @@ import struct
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
 
-from reconstruction.arrays import AnyFloats, Floats
+from reconstruction.arrays import AnyFloats, Array, Floats
+from reconstruction.files.colour import REC709, to_rec709
 from reconstruction.files.durable import PAGE, writing
 
 Attributes = Mapping[str, float | str]
 
 
 class OtherChannels(ValueError):
-    """A valid file without the channels R, G and B."""
+    """A valid file without one image of R, G and B, or with attributes that are not read."""
+
+
+MOST_PIXELS = 1 << 28
+"""Pixels of a display window; the largest sensors have 151 million."""
 
 
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
-    """Read R, G and B `(H, W, 3)`, or Y as grey, and the header attributes of `write_exr`.
+    """Read the display window `(H, W, 3)` as linear Rec. 709, black outside the data window, and
+    the numbers and texts of the header.
 
-    Raises `ValueError` naming a file that is missing, broken or has other channels.
+    The image is the only part with R, G and B, else the only layer with them or with Y. Raises
+    `ValueError` naming a file that is missing or broken, has other channels, or an attribute that
+    is not read.
     """
+    number, names, header = chosen_image(path)
+    _check(path, header)
+    image = _pixels(path, number, names)
+    image = _in_display_window(path, np.asarray(image, np.float32), header)
+    matrix = _to_rec709(path, header)
+    if matrix is not None:
+        image = image @ matrix.T.astype(np.float32)
+    own = {k: v for k, v in header.items() if isinstance(v, float | str)}
+    return np.ascontiguousarray(image), own
+
+
+def chosen_image(path: str | Path) -> tuple[int, list[str], dict[str, Any]]:
+    """The number of the part that `read_exr` reads, the names of its channels (R, G, B; or Y), and
+    its header. Raises `ValueError`."""
     try:
-        with suppress(Exception):  # other files are handled below
-            file = OpenEXR.File(str(path))  # faster; fails for mixed channel types
-            found = file.channels()
-            pixels = found["RGBA" if "RGBA" in found else "RGB"].pixels
-            return np.ascontiguousarray(pixels[..., :3], np.float32), _own(file)
-        file = OpenEXR.File(str(path), separate_channels=True)
-        channels = {name: channel.pixels for name, channel in file.channels().items()}
+        parts = OpenEXR.File(str(path), header_only=True).parts
+        headers = [dict(part.header) for part in parts]
     except Exception as error:  # the binding raises RuntimeError and MemoryError
-        raise ValueError(f"{path}: cannot be read as OpenEXR ({error})") from error
-    colours = "YYY" if set(channels) - {"A"} == {"Y"} else "RGB"
-    if not set(colours) <= set(channels) or len({channels[c].shape for c in colours}) > 1:
-        there = ", ".join(sorted(channels))
+        raise _broken(path, error) from error
+    plain, layers = [], []
+    for number, header in enumerate(headers):
+        there = {c.name for c in header["channels"]}
+        for layer in sorted({n[: n.rfind(".") + 1] for n in there}):
+            own = {n[len(layer) :] for n in there if n.startswith(layer)}
+            if own >= set("RGB"):
+                (layers if layer else plain).append((number, [layer + c for c in "RGB"]))
+            elif "Y" in own and not own & {"X", "Z", "RY", "BY"}:  # no vectors, no chroma
+                layers.append((number, [layer + "Y"]))
+    found = plain or layers
+    if len(found) == 1:
+        number, names = found[0]
+        return number, names, headers[number]
+    listed = "; ".join(
+        f"part {header.get('name', number)!r}: " * (len(headers) > 1)
+        + ", ".join(sorted(c.name for c in header["channels"]))
+        for number, header in enumerate(headers)
+    )
+    raise OtherChannels(
+        f"{path}: expected channels R, G and B of one image, got {listed}: "
+        "write the image as RGB without layers, in one part"
+    )
+
+
+def window_size(window: Any) -> tuple[int, int]:
+    """Width and height of a data or display window."""
+    width, height = (int(b) - int(a) + 1 for a, b in zip(*window, strict=True))
+    return width, height
+
+
+def _broken(path: str | Path, error: object) -> ValueError:
+    return ValueError(f"{path}: cannot be read as OpenEXR ({error})")
+
+
+def _check(path: str | Path, header: Mapping[str, Any]) -> None:
+    """Raise `OtherChannels` for an attribute that changes pixels and is not read."""
+    for name in ("chromaticities", "whiteLuminance", "adoptedNeutral", "pixelAspectRatio"):
+        if isinstance(header.get(name), OpenEXR.OpaqueAttribute):
+            raise OtherChannels(f"{path}: {name} has a type that is not its own: remove it")
+    width, height = window_size(header["displayWindow"])
+    white, neutral = header.get("whiteLuminance"), header.get("adoptedNeutral")
+    space = str(header.get("colorInteropID", "unknown"))
+    wrong = ""
+    if "deep" in str(header.get("type", "")):
+        wrong = f"type {str(header['type']).split('.')[-1]}: flatten the deep samples"
+    elif "CUBE" in str(header.get("envmap", "")):
+        wrong = "envmap cube: write a lat-long map"
+    elif width * height > MOST_PIXELS:
+        wrong = f"displayWindow has {width}x{height} pixels: at most {MOST_PIXELS:,} are read"
+    elif white is not None:
+        wrong = f"whiteLuminance {white:g} cd/m²: write radiance, without this attribute"
+    elif neutral is not None and not np.allclose(neutral, _chromaticities(header)[6:], atol=1e-3):
+        xy = " ".join(f"{x:g}" for x in neutral)
+        wrong = f"adoptedNeutral {xy} is not white: balance the image and remove the attribute"
+    elif not space.startswith(("lin_rec709", "unknown")) and (
+        "chromaticities" not in header or not space.startswith("lin_")
+    ):
+        wrong = f"colorInteropID {space!r}: write linear Rec. 709, or lin_… with chromaticities"
+    if wrong:
+        raise OtherChannels(f"{path}: {wrong}")
+
+
+def _chromaticities(header: Mapping[str, Any]) -> tuple[float, ...]:
+    return tuple(map(float, header.get("chromaticities", REC709)))
+
+
+def _to_rec709(path: str | Path, header: Mapping[str, Any]) -> Array | None:
+    try:
+        return to_rec709(_chromaticities(header))
+    except ValueError as error:
+        raise OtherChannels(f"{path}: {error}") from error
+
+
+def _in_display_window(path: str | Path, image: Floats, header: Mapping[str, Any]) -> Floats:
+    """`image` of the data window at its place in the display window."""
+    data, display = (np.array(header[name], int) for name in ("dataWindow", "displayWindow"))
+    if (data == display).all():
+        return image
+    low, high = np.maximum(data[0], display[0]), np.minimum(data[1], display[1])
+    if (low > high).any():
         raise OtherChannels(
-            f"{path}: expected channels R, G and B of one size, got {there}: write the "
-            "image as RGB "
-            "without layers"
+            f"{path}: dataWindow {data.tolist()} lies outside displayWindow {display.tolist()}: "
+            "write the image inside it"
         )
-    return np.stack([channels[c] for c in colours], axis=-1, dtype=np.float32), _own(file)
+    width, height = window_size(display)
+    out = np.zeros((height, width, 3), np.float32)
+    to, of = low - display[0], low - data[0]
+    w, h = high - low + 1
+    out[to[1] : to[1] + h, to[0] : to[0] + w] = image[of[1] : of[1] + h, of[0] : of[0] + w]
+    return out
 
 
-def _own(file: OpenEXR.File) -> dict[str, float | str]:
-    """Header attributes that are numbers or text."""
-    return {k: v for k, v in file.header().items() if isinstance(v, float | str)}
+def _pixels(path: str | Path, number: int, names: list[str]) -> AnyFloats:
+    """R, G and B `(h, w, 3)` of the data window of a part."""
+    if names == ["R", "G", "B"]:
+        with suppress(Exception):  # faster; fails for mixed channel types
+            found = OpenEXR.File(str(path)).parts[number].channels
+            return np.asarray(found["RGBA" if "RGBA" in found else "RGB"].pixels[..., :3])
+    try:
+        found = OpenEXR.File(str(path), separate_channels=True).parts[number].channels
+        pixels = [found[name].pixels for name in names]
+        steps = [(found[name].xSampling, found[name].ySampling) for name in names]
+    except Exception as error:  # the binding raises RuntimeError and MemoryError
+        raise _broken(path, error) from error
+    if set(steps) != {(1, 1)}:
+        raise OtherChannels(f"{path}: channels sampled {steps}: write R, G and B of every pixel")
+    return np.stack(pixels * (3 // len(pixels)), axis=-1, dtype=np.float32)
 
 
 def write_exr(

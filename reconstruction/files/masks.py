@@ -49,11 +49,10 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
     if (found := _SIZE.unpack_from(data, 16)) != (width, height):
         raise ValueError(f"{expected}, got {found[0]}x{found[1]}")
     end, packed = 8, list[memoryview]()
-    while end + _LENGTH.size <= len(data):
-        length = _LENGTH.unpack_from(data, end)[0]
-        if data[end + 4 : end + 8] == b"IDAT":
-            packed.append(memoryview(data)[end + 8 : end + 8 + length])
-        end += 12 + length  # a chunk's header, data and checksum
+    for kind, begin, length in _chunks(data):
+        if kind == b"IDAT":
+            packed.append(memoryview(data)[begin : begin + length])
+        end = begin + length + 4  # after the checksum
     if end <= len(data) and _exceeds(packed, 2 * height * (width * _WIDEST + 1)):
         raise ValueError(f"{expected}, got a file with more data than these pixels need")
     image: NDArray[np.uint8] | None = None
@@ -61,10 +60,44 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), AS_STORED | cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape != (height, width):
         raise ValueError(f"{expected}, got a damaged file")
+    if (turn := exif_orientation(png_chunks(data).get(b"eXIf", b""))) != 1:
+        raise ValueError(f"EXIF orientation {turn}: write the mask in the camera's pixels, without")
     mask = half_grey(image)
     if data[_COLOUR_TYPE] in _MAYBE_TRANSPARENT:
         check_alpha(data, mask)
     return mask
+
+
+def _chunks(data: bytes) -> Iterable[tuple[bytes, int, int]]:
+    """Kind, begin and length of each chunk's data."""
+    at = 8
+    while at + _LENGTH.size <= len(data):
+        length = _LENGTH.unpack_from(data, at)[0]
+        yield data[at + 4 : at + 8], at + 8, length
+        at += 12 + length
+
+
+def png_chunks(data: bytes) -> dict[bytes, bytes]:
+    """The data of a PNG's chunks other than pixels, the first of each kind."""
+    found: dict[bytes, bytes] = {}
+    for kind, begin, length in _chunks(data):
+        if kind != b"IDAT":
+            found.setdefault(kind, data[begin : begin + length])
+    return found
+
+
+def exif_orientation(exif: bytes) -> int:
+    """Orientation 1 to 8 of EXIF data; 1 without."""
+    order = {b"II": "<", b"MM": ">"}.get(exif[:2])
+    try:
+        first = struct.unpack_from(f"{order}I", exif, 4)[0] if order else len(exif)
+        count = struct.unpack_from(f"{order}H", exif, first)[0] if order else 0
+        entries = [
+            struct.unpack_from(f"{order}HHIH", exif, first + 2 + 12 * i) for i in range(count)
+        ]
+    except struct.error:
+        return 1
+    return next((value for tag, _, _, value in entries if tag == 274 and 1 <= value <= 8), 1)
 
 
 def _exceeds(packed: Iterable[memoryview], most: int) -> bool:

@@ -1,7 +1,7 @@
-"""Images of cameras as linear light: EXR, PNG, TIFF, JPEG, AVIF and RAW.
+"""Images of cameras as linear light: EXR, Radiance, PNG, TIFF, JPEG, AVIF and RAW.
 
-OpenImageIO reads all but RAW (rawpy), AVIF (OpenCV) and EXR. The size is checked before pixels are
-read, as a header may claim more than memory.
+OpenImageIO reads all but RAW (rawpy), AVIF (OpenCV), EXR and Radiance. The size is checked before
+pixels are read, as a header may claim more than memory.
 """
 
 from __future__ import annotations
@@ -13,54 +13,62 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 import OpenEXR
-import OpenImageIO as oiio
 import rawpy
 from numpy.typing import NDArray
 from pydantic import Field
 
 from reconstruction.arrays import Bools, Floats
+from reconstruction.files.colour import Colour, Curve, decoded
+from reconstruction.files.encoded import (
+    FORMATS,
+    RAW,
+    PictureError,
+    Placement,
+    Size,
+    broken,
+    opened,
+    placement,
+    stored_values,
+    turned,
+)
 from reconstruction.files.exr import OtherChannels, read_exr
-from reconstruction.files.masks import AS_STORED
+from reconstruction.files.tiff_tags import dng_levels
 from reconstruction.options import options
 
 Positive = Annotated[float, Field(gt=0)]
-Size = tuple[int, int]
-"""Width and height."""
-
-RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"}
-FORMATS = {".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".avif"} | RAW
 MOSAICS = {
     "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
     "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
     "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
     "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
 }
+ASPECT = 0.02
+"""Difference of a pixel's aspect from the camera's that is rounding."""
 LOSSY = {".jpg", ".jpeg"}
-_AVIF_HEAD = 1 << 16  # bytes with an AVIF's boxes
 FULL = 0.99
 """Share of the range from black to white at which an integer channel counts as saturated: sensors
 are nonlinear near the end."""
-
-
-class PictureError(ValueError):
-    """An image that cannot be used; the message names the file and what to do."""
+_CLIPPED = 64
+"""Pixels of a mosaic at its largest value that are a sensor's clipping."""
 
 
 @options
 class Sensor:
     """Conversion of image values to light.
 
-    `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: "srgb" for 8 bits,
-    JPEG and AVIF, else "linear". `black` and `white` in the file's values: no light, and a full
-    channel; None: those of a RAW file, else 0 and the largest of the type (1 for floats, which
-    saturate only with `white` or the EXR attribute `fullScale`). `bayer`: the colours of the first
-    two rows of a sensor's mosaic.
+    `response`: "linear", "srgb", or the exponent γ of value = light^(1/γ); None: the file's own
+    (gAMA, cICP, ICC), else "srgb" for 8 bits, JPEG and AVIF, else "linear". `black` and `white` in
+    the file's values: no light, and a full channel; None: those of the file, else 0 and the largest
+    of the type (1 for floats, which saturate only with `white` or the EXR attribute `fullScale`).
+    `bayer`: the colours of the first two rows of a sensor's mosaic. `orientation`: whether the
+    camera's pixels are those stored, or turned by EXIF; None: by the size, if that decides.
     """
 
     response: Literal["linear", "srgb"] | Positive | None = None
     black: Annotated[float, Field(ge=0)] | None = None
     white: Positive | None = None
     bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+    orientation: Literal["stored", "turned"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,23 +85,12 @@ class Picture:
     quantum: Any
 
 
-def picture_size(path: Path) -> Size:
-    """Width and height from the header. Raises `PictureError`."""
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".exr":
-            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-            return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
-        if suffix in RAW:
-            with rawpy.imread(str(path)) as raw:
-                return int(raw.sizes.width), int(raw.sizes.height)
-    except Exception as error:  # the bindings raise various types
-        raise PictureError(_broken(path, error)) from error
-    if suffix == ".avif":
-        height, width = _avif(path).shape[:2]
-        return width, height
-    spec = _opened(path).spec()
-    return int(spec.width), int(spec.height)
+def picture_size(path: Path, like: Size | None = None) -> Size:
+    """Width and height from the header; turned by EXIF where only that fits the camera's size
+    `like`, upright or wide. Raises `PictureError`."""
+    place = placement(path)
+    fits = like is None or (place.size[0] > place.size[1]) == (like[0] > like[1])
+    return place.size if fits else place.turned
 
 
 def exposure_of(path: Path) -> tuple[float, str]:
@@ -109,13 +106,13 @@ def exposure_of(path: Path) -> tuple[float, str]:
             header = OpenEXR.File(str(path), header_only=True).header()
             values = (header.get("exposureTime", header.get("expTime")), 0, 0)
         else:
-            spec = _opened(path).spec()
+            spec = opened(path).spec()
             names = ("ExposureTime", "Exif:PhotographicSensitivity", "FNumber")
             values = tuple(spec.getattribute(name) for name in names)
     except PictureError:
         raise
     except Exception as error:  # the bindings raise various types
-        raise PictureError(_broken(path, error)) from error
+        raise PictureError(broken(path, error)) from error
     seconds, iso, stop = (float(x or 0) for x in values)
     if not 0 < seconds < np.inf:
         raise PictureError(
@@ -125,60 +122,58 @@ def exposure_of(path: Path) -> tuple[float, str]:
     return seconds, f"ISO {iso:g} f/{stop:.3g}"
 
 
-def read_picture(path: Path, sensor: Sensor, size: Size) -> Picture:
-    """Read an image of `size`. Raises `PictureError` for another size or format, or damage."""
+def read_picture(path: Path, sensor: Sensor, size: Size, aspect: float | None = None) -> Picture:
+    """Read an image of `size`, of a camera whose focal length in pixels down is `aspect` times that
+    across. Raises `PictureError` for another size, format or aspect, for damage, and for what the
+    file contains but cannot be read as light."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise PictureError(f"{path}: unknown format; expected {' '.join(sorted(FORMATS))}")
-    found = picture_size(path)
-    if found != size:
+    place = placement(path)
+    turn = _orientation(path, place, sensor, size)
+    if aspect is not None and place.aspect != 1 and abs(place.aspect / aspect - 1) > ASPECT:
         raise PictureError(
-            f"{path}: {found[0]}x{found[1]} pixels, expected {size[0]}x{size[1]} as the camera: "
-            "replace the image, or remove it (a frame may be missing)"
+            f"{path}: pixelAspectRatio {place.aspect:.4g}, but fy / fx of the camera is "
+            f"{aspect:.4g}: correct K, or the attribute"
         )
     if suffix == ".exr":
-        return _exr(path, sensor)
-    if suffix in RAW:
-        return _raw(path, sensor)
-    if suffix == ".avif":
-        white, response = sensor.white or _avif_white(path), sensor.response or "srgb"
-        return _counts(path, _avif(path), replace(sensor, white=white, response=response))
-    source = _opened(path)
-    values = source.read_image(oiio.UNKNOWN)
-    if values is None or source.geterror(False):
-        raise PictureError(_broken(path, source.geterror()))
-    return _counts(path, np.asarray(values), sensor)
+        picture = _exr(path, sensor)
+    elif suffix in RAW:
+        picture = _raw(path, sensor)
+    else:
+        values, white, colour = stored_values(path)
+        if sensor.white is None and white is not None:
+            sensor = replace(sensor, white=white)
+        picture = _counts(path, values, sensor, colour)
+    return _turned_picture(picture, turn)
 
 
-def _avif(path: Path) -> NDArray[Any]:
-    """Integer values `(H, W, 3)`; OpenImageIO's wheels do not read AVIF."""
-    how = AS_STORED | cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
-    values = cv2.imread(str(path), how)
-    if values is None:
-        raise PictureError(_broken(path, "OpenCV cannot read it"))
-    return np.asarray(values)
+def _orientation(path: Path, place: Placement, sensor: Sensor, size: Size) -> int:
+    """The orientation to apply for a camera of `size`. Raises `PictureError`."""
+    turn = 1 if sensor.orientation == "stored" else place.orientation
+    fits = {s for s in ("stored", "turned") if size == (place.size, place.turned)[s == "turned"]}
+    if not fits or (sensor.orientation and sensor.orientation not in fits):
+        raise PictureError(
+            f"{path}: {place.size[0]}x{place.size[1]} pixels, expected {size[0]}x{size[1]} as the "
+            "camera: replace the image, or remove it (a frame may be missing)"
+        )
+    if turn == 1 or sensor.orientation:
+        return turn
+    if len(fits) == 2:
+        raise PictureError(
+            f"{path}: EXIF orientation {turn} and the camera's size fit both ways: set "
+            'sensor.orientation = "stored" if the camera is calibrated on the pixels as stored, '
+            'else "turned"'
+        )
+    return turn if fits == {"turned"} else 1
 
 
-def _avif_white(path: Path) -> float:
-    """Largest value, from the `av1C` box ("AV1 Codec ISO Media File Format", 2.3.3)."""
-    head = path.read_bytes()[:_AVIF_HEAD]
-    at = head.find(b"av1C")
-    flags = head[at + 6] if 0 <= at < len(head) - 6 else 0
-    return float(2 ** (8 + 2 * (flags >> 6 & 1) + 2 * (flags >> 5 & 1)) - 1)
-
-
-def _opened(path: Path) -> Any:
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # colours are not multiplied by alpha
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise PictureError(_broken(path, oiio.geterror()))
-    return source
-
-
-def _broken(path: Path, error: object) -> str:
-    text = " ".join(str(error).split()) or "truncated or damaged"
-    return f"{path}: cannot be read ({text}): copy it again, or remove it (a frame may be missing)"
+def _turned_picture(picture: Picture, turn: int) -> Picture:
+    if turn == 1:
+        return picture
+    step = picture.quantum if np.ndim(picture.quantum) == 0 else turned(picture.quantum, turn)
+    light, saturated = turned(picture.light, turn), turned(picture.saturated, turn)
+    return replace(picture, light=light, saturated=saturated, quantum=step)
 
 
 def _exr(path: Path, sensor: Sensor) -> Picture:
@@ -187,9 +182,8 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
     except OtherChannels as error:
         raise PictureError(str(error)) from error
     except ValueError as error:
-        raise PictureError(_broken(path, error)) from error
-    if not np.isfinite(image).all():
-        raise PictureError(f"{path}: has pixels that are not finite")
+        raise PictureError(broken(path, error)) from error
+    image, infinite = _finite(path, image, np.float16)
     white, black = sensor.white or 1.0, sensor.black or 0.0
     if not black < white:
         raise PictureError(
@@ -197,15 +191,33 @@ def _exr(path: Path, sensor: Sensor) -> Picture:
             "file's values"
         )
     full = sensor.white or float(attributes.get("fullScale", np.inf))
+    if infinite.any():
+        full = min(full, float(np.finfo(np.float16).max))
     saturated = np.asarray((image >= full * (1 - 1e-5)).any(axis=-1))
     gamma = 1.0 if sensor.response is None else sensor.response
-    light = _decoded((image - black) / (white - black), gamma)
+    light = decoded((image - black) / (white - black), gamma)
     quantum = float(attributes.get("countScale", 0.0)) / (white - black)
     return Picture(light, saturated, (full - black) / (white - black), quantum)
 
 
-def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
-    """An image of integers `(H, W, C)`, or of floats in a TIFF."""
+def _finite(path: Path, values: Any, kind: Any) -> tuple[Any, Bools]:
+    """`values` with infinity as the largest number of `kind` (beyond the range of half floats is
+    saturated), and where it is. Raises `PictureError` for other values that are not finite."""
+    infinite = np.isposinf(values)
+    if infinite.any():
+        values = np.where(infinite, np.finfo(kind).max, values)
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):
+        row, column, channel = wrong[0]
+        raise PictureError(
+            f"{path}: {len(wrong)} values are not finite, the first at row {row}, column {column}: "
+            f"{values[row, column, channel]}: replace them by numbers"
+        )
+    return values, np.asarray(infinite.any(axis=-1))
+
+
+def _counts(path: Path, values: NDArray[Any], sensor: Sensor, colour: Colour) -> Picture:
+    """An image of integers `(H, W, C)`, or of floats in a TIFF or Radiance file."""
     whole = np.issubdtype(values.dtype, np.integer)
     white = sensor.white or (float(np.iinfo(values.dtype).max) if whole else 1.0)
     black = sensor.black or 0.0
@@ -218,19 +230,41 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor) -> Picture:
                 f"{path}: expected one channel for a mosaic ({sensor.bayer}), got {colours}"
             )
         return _mosaic(values[..., 0], sensor.bayer, black, white)
+    if whole and sensor.white is None:
+        _check_bits(path, values)
     numbers = np.repeat(values[..., :1], 3, axis=-1) if colours < 3 else values[..., :3]
-    if not np.isfinite(numbers).all():
-        raise PictureError(f"{path}: has pixels that are not finite")
+    infinite = None
+    if not whole:
+        numbers, infinite = _finite(path, numbers, np.float16)
     share = (numbers.astype(np.float32) - np.float32(black)) / np.float32(white - black)
     full = np.float32(FULL if whole or sensor.white else np.inf)
+    if infinite is not None and infinite.any():
+        full = min(full, share.dtype.type((np.finfo(np.float16).max - black) / (white - black)))
     saturated = np.asarray((share >= full).any(axis=-1))
-    gamma = sensor.response
+    gamma: Curve | None = sensor.response if sensor.response is not None else colour.curve
     if gamma is None:
         gamma = "srgb" if values.dtype == np.uint8 else "linear"
-    light = _decoded(share, gamma)
+    light = decoded(share, gamma)
     step = np.float32(1 / (white - black)) if whole else np.float32(0)
-    quantum = _decoded(share + step, gamma) - light if gamma != "linear" else step
-    return Picture(light, saturated, float(_decoded(full, gamma)), quantum)
+    quantum = decoded(share + step, gamma) - light if gamma != "linear" else step
+    full = float(decoded(full, gamma))
+    if colour.matrix is not None:
+        light = np.asarray(light @ colour.matrix.T, np.float32)
+        quantum = np.broadcast_to(quantum, light.shape)
+    return Picture(light, saturated, full, quantum)
+
+
+def _check_bits(path: Path, values: NDArray[Any]) -> None:
+    """Raise `PictureError` where 16 bits hold a sensor's 10, 12 or 14 that clip."""
+    most = int(values.max(initial=0))
+    if values.dtype != np.uint16 or most not in (1023, 4095, 16383):
+        return
+    if (values == most).sum() >= max(_CLIPPED, 8 * (values == most - 1).sum()):
+        bits = most.bit_length()
+        raise PictureError(
+            f"{path}: 16 bits, but values end at {most} as of {bits} bits: set sensor.white = "
+            f"{most} (65535 if they do not)"
+        )
 
 
 def _raw(path: Path, sensor: Sensor) -> Picture:
@@ -238,39 +272,59 @@ def _raw(path: Path, sensor: Sensor) -> Picture:
         with rawpy.imread(str(path)) as raw:
             values, pattern = raw.raw_image_visible.copy(), raw.raw_pattern
             colours = raw.color_desc.decode()
-            blacks, white = list(raw.black_level_per_channel), float(raw.white_level)
+            sites = raw.raw_colors_visible.copy()
+            blacks, whites = raw.black_level_per_channel, raw.camera_white_level_per_channel
+            white = np.full(4, float(raw.white_level))
     except Exception as error:
-        raise PictureError(_broken(path, error)) from error
+        raise PictureError(broken(path, error)) from error
     bayer = ""
     if pattern is not None and pattern.shape == (2, 2) and values.ndim == 2:
         bayer = "".join(colours[i] for i in pattern.ravel())
     if bayer not in MOSAICS:
         raise PictureError(f"{path}: not a Bayer mosaic: develop it to a linear 16-bit TIFF")
-    black = float(np.mean(blacks)) if sensor.black is None else sensor.black
-    white = sensor.white or white
-    if not black < white:
-        raise PictureError(f"{path}: black {black:g} must be below white {white:g}")
-    return _mosaic(values, bayer, black, white)
+    if whites is not None and all(0 < w <= white[0] for w in whites):
+        white = np.array(whites, float)  # where the sensor clips, from the maker's notes
+    try:
+        levels = np.array(blacks, float)[sites], white[sites]
+        if path.suffix.lower() == ".dng":
+            levels = dng_levels(path, values.shape, sites)
+    except ValueError as error:
+        raise PictureError(f"{path}: {error}") from error
+    except Exception as error:  # of wrong tags
+        raise PictureError(broken(path, error)) from error
+    low, high = (
+        x if given is None else np.full(values.shape, given)
+        for x, given in zip(levels, (sensor.black, sensor.white), strict=True)
+    )
+    black, top = float(low.mean()), float(high.max())
+    if not (low < high).all():
+        raise PictureError(f"{path}: black {low.max():g} must be below white {high.min():g}")
+    if (low != black).any() or (high != top).any():
+        values = black + (values - low) * ((top - black) / (high - low))
+    clips = top if sensor.white else min(top, _clipping(values))
+    return _mosaic(values, bayer, black, top, clips)
 
 
-def _mosaic(values: NDArray[Any], bayer: str, black: float, white: float) -> Picture:
-    """Linear light of a mosaic `(H, W)`, interpolated along edges, and pixels it saturates."""
-    full = black + FULL * (white - black)
+def _clipping(values: NDArray[Any]) -> float:
+    """The value at which a mosaic's sensor clips, if the image has such pixels, else inf: many at
+    the largest value, few at each of those below."""
+    counts = np.rint(values).clip(0).astype(np.int64)
+    most = int(counts.max(initial=0))
+    below = np.bincount(counts.ravel(), minlength=most + 1)[int(0.9 * most) : -1]
+    many = int((counts == most).sum())
+    found = many >= max(_CLIPPED, 8 * below.max(initial=0)) and (below > 0).sum() >= 8
+    return float(most) if found else np.inf
+
+
+def _mosaic(
+    values: NDArray[Any], bayer: str, black: float, white: float, clips: float = np.inf
+) -> Picture:
+    """Linear light of a mosaic `(H, W)`, interpolated along edges, and pixels it saturates: near
+    `white`, or `clips` if the sensor saturates below it."""
+    full = black + FULL * (min(white, clips) - black)
     saturated = cv2.dilate((values >= full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    deep = values.astype(np.uint16)
-    shift = max(0, 15 - int(deep.max(initial=1)).bit_length())  # precision below one count
-    image = cv2.demosaicing(deep << shift, MOSAICS[bayer]).astype(np.float32) / (1 << shift)
+    shift = max(0, 15 - int(values.max(initial=1)).bit_length())  # precision below one count
+    deep = np.rint(np.clip(values * float(1 << shift), 0, 65535)).astype(np.uint16)
+    image = cv2.demosaicing(deep, MOSAICS[bayer]).astype(np.float32) / (1 << shift)
     light = (image - np.float32(black)) / np.float32(white - black)
-    return Picture(light, saturated, FULL, 1 / (white - black))
-
-
-def _decoded(share: Any, response: Literal["linear", "srgb"] | float) -> Any:
-    """Linear light of values with white at 1 (IEC 61966-2-1 for sRGB); odd below 0."""
-    if response == "linear" or response == 1.0:
-        return share
-    value = np.abs(share)
-    if response == "srgb":
-        light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    else:
-        light = value ** float(response)
-    return np.asarray(np.sign(share) * light, np.float32)
+    return Picture(light, saturated, (full - black) / (white - black), 1 / (white - black))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from reconstruction.containment import plain_file
-from reconstruction.files.exr import read_exr
+from reconstruction.files.exr import read_exr, window_size
 from reconstruction.files.masks import read_mask
+from reconstruction.files.radiance import hdr_size
 from reconstruction.geometry.mesh import read_obj
 from stage_service.decoding.frame_pictures import frame_figures, png_of_frame
 from stage_service.decoding.framing import Part
@@ -26,9 +26,6 @@ from stage_service.decoding.limits import (
 )
 
 Response = tuple[dict[str, Any], list[Part]]
-_RADIANCE_SIZE = re.compile(rb"\n\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n")
-_RADIANCE_HEADER = 1 << 16
-"""Leading bytes of a Radiance file in which its size is searched."""
 
 
 def preload() -> None:
@@ -107,32 +104,22 @@ def _check_exr(file: Path, most: int) -> None:
     """Raise `ValueError` if an OpenEXR file unpacks to more than `most` pixels."""
     plain_file(file)
     try:
-        parts = OpenEXR.File(str(file), header_only=True).parts
-        sizes = [_size(part.header) for part in parts]
+        headers = [part.header for part in OpenEXR.File(str(file), header_only=True).parts]
+        windows = [window_size(h[n]) for h in headers for n in ("dataWindow", "displayWindow")]
+        channels = sum(len(header["channels"]) for header in headers)
     except Exception as error:  # the binding raises various classes
         raise ValueError(f"{file}: cannot be read as OpenEXR ({error})") from error
-    for width, height, channels in sizes:
-        _check_size(file, width, height, most)
-        if channels > MOST_CHANNELS:
-            raise ValueError(f"{file}: {channels} channels; at most {MOST_CHANNELS} are read")
-    if len(sizes) > 1:
-        raise ValueError(f"{file}: {len(sizes)} parts; expected one image")
-
-
-def _size(header: dict[str, Any]) -> tuple[int, int, int]:
-    low, high = header["dataWindow"]
-    width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-    return width, height, len(header["channels"])
+    for size in windows:
+        _check_size(file, *size, most)
+    if channels > MOST_CHANNELS:
+        raise ValueError(f"{file}: {channels} channels; at most {MOST_CHANNELS} are read")
+    if any("deep" in str(header.get("type", "")) for header in headers):
+        raise ValueError(f"{file}: has deep samples: write it without them")
 
 
 def _check_radiance(file: Path, most: int) -> None:
     """The same of a Radiance file."""
-    with plain_file(file).open("rb") as opened:
-        found = _RADIANCE_SIZE.search(opened.read(_RADIANCE_HEADER))
-    if found is None:
-        raise ValueError(f"{file}: not a Radiance .hdr image: it has no size")
-    first, second = (int(n) for n in found.groups())
-    _check_size(file, second, first, most)
+    _check_size(file, *hdr_size(file), most)
 
 
 def _check_obj(file: Path, most: int) -> None:
