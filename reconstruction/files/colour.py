@@ -14,6 +14,8 @@ from reconstruction.arrays import Array
 Curve = Literal["linear", "srgb"] | float | Callable[[Any], Any]
 """Values with white at 1 to linear light: sRGB, the exponent of a power, or a function."""
 
+Numbers = Sequence[float] | Array
+
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """x and y of red, green, blue and white."""
 _REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
@@ -36,7 +38,7 @@ class Colour:
     matrix: Array | None = None
 
 
-def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
+def rgb_to_xyz(chromaticities: Numbers) -> Array:
     """Matrix `(3, 3)` with luminance 1 for white. Raises `ValueError` for no primaries."""
     xy = np.asarray(chromaticities, float).reshape(-1, 2)
     if xy.shape != (4, 2) or not np.isfinite(xy).all() or (xy[3] <= 0).any():
@@ -47,7 +49,7 @@ def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
     return np.asarray(columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3] / xy[3, 1]))
 
 
-def to_rec709(chromaticities: Sequence[float]) -> Array | None:
+def to_rec709(chromaticities: Numbers) -> Array | None:
     """Matrix from linear RGB of `chromaticities` to Rec. 709; white stays white (Bradford), as
     OpenEXR's `AcesInputFile` converts. None if nothing changes."""
     matrix = rgb_to_xyz(chromaticities)
@@ -163,9 +165,9 @@ def _adaptation(white: Array, target: Array) -> Array:
     return np.asarray(np.linalg.solve(_BRADFORD, gain[:, None] * _BRADFORD))
 
 
-def _unless_same(matrix: Array) -> Array | None:
+def _unless_same(matrix: Any) -> Array | None:
     return None if np.allclose(matrix, np.eye(3), atol=_SAME) else np.asarray(matrix)
 
 
-def _numbers(values: Sequence[float]) -> str:
+def _numbers(values: Numbers) -> str:
     return ", ".join(f"{float(v):g}" for v in values)

@@ -54,7 +54,8 @@ def chosen_image(path: str | Path) -> tuple[int, list[str], dict[str, Any]]:
         headers = [dict(part.header) for part in parts]
     except Exception as error:  # the binding raises RuntimeError and MemoryError
         raise _broken(path, error) from error
-    plain, layers = [], []
+    plain: list[tuple[int, list[str]]] = []
+    layers: list[tuple[int, list[str]]] = []
     for number, header in enumerate(headers):
         there = {c.name for c in header["channels"]}
         for layer in sorted({n[: n.rfind(".") + 1] for n in there}):

@@ -237,17 +237,17 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor, colour: Colour) ->
     if not whole:
         numbers, infinite = _finite(path, numbers, np.float16)
     share = (numbers.astype(np.float32) - np.float32(black)) / np.float32(white - black)
-    full = np.float32(FULL if whole or sensor.white else np.inf)
+    limit = np.float32(FULL if whole or sensor.white else np.inf)
     if infinite is not None and infinite.any():
-        full = min(full, share.dtype.type((np.finfo(np.float16).max - black) / (white - black)))
-    saturated = np.asarray((share >= full).any(axis=-1))
+        limit = min(limit, np.float32((np.finfo(np.float16).max - black) / (white - black)))
+    saturated = np.asarray((share >= limit).any(axis=-1))
     gamma: Curve | None = sensor.response if sensor.response is not None else colour.curve
     if gamma is None:
         gamma = "srgb" if values.dtype == np.uint8 else "linear"
     light = decoded(share, gamma)
     step = np.float32(1 / (white - black)) if whole else np.float32(0)
     quantum = decoded(share + step, gamma) - light if gamma != "linear" else step
-    full = float(decoded(full, gamma))
+    full = float(decoded(limit, gamma))
     if colour.matrix is not None:
         light = np.asarray(light @ colour.matrix.T, np.float32)
         quantum = np.broadcast_to(quantum, light.shape)
@@ -301,6 +301,8 @@ def _raw(path: Path, sensor: Sensor) -> Picture:
         raise PictureError(f"{path}: black {low.max():g} must be below white {high.min():g}")
     if (low != black).any() or (high != top).any():
         values = black + (values - low) * ((top - black) / (high - low))
+        below = min(0.0, float(values.min()))  # demosaicing needs positive numbers
+        values, black, top = values - below, black - below, top - below
     clips = top if sensor.white else min(top, _clipping(values))
     return _mosaic(values, bayer, black, top, clips)
 

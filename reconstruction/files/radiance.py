@@ -45,16 +45,16 @@ def read_hdr(path: Path) -> Floats:
     header = _header(path, data[:_HEADER])
     lines, count = header.size
     pixels = data[header.begin :]
-    packed = 8 <= count < 1 << 15 and pixels[:4] == bytes([2, 2, count >> 8, count & 255])
+    packed = 8 <= count < 1 << 15 and pixels[:2] == b"\2\2" and pixels[2:3] < b"\x80"
     image = (_packed if packed else _flat)(pixels, lines, count)
     if image is None:
         raise ValueError(
             f"{path}: cannot be read (truncated, damaged or of the old packing; {lines} lines of "
             f"{count} pixels): copy it again, or write it anew"
         )
-    image = image / header.scale
+    image = np.asarray(image / header.scale, np.float32)
     if header.matrix is not None:
-        image = image @ header.matrix.T
+        image = np.asarray(image @ header.matrix.T, np.float32)
     if header.axes[1] == "X":
         image = image.swapaxes(0, 1)
     image = image[:: -1 if "+Y" in header.axes else 1, :: -1 if "-X" in header.axes else 1]
@@ -72,8 +72,8 @@ def _header(path: Path, data: bytes) -> _Header:
     if b"\nFORMAT=" not in data[: match.start()]:
         raise ValueError(f"{path}: no FORMAT: write FORMAT=32-bit_rle_rgbe")
     out = _Header(first + one + second + other, (int(rows), int(columns)), found.end())
-    for line in data[: match.start()].decode("latin-1").splitlines()[1:]:
-        name, _, text = line.partition("=")
+    for line in data[: match.start()].decode("latin-1").split("\n")[1:]:
+        name, _, text = line.rstrip("\r").partition("=")
         if name == "FORMAT":
             if text.strip() not in ("32-bit_rle_rgbe", "32-bit_rle_xyze"):
                 raise ValueError(f"{path}: FORMAT {text.strip()!r}: write 32-bit_rle_rgbe")
@@ -103,7 +103,8 @@ def _header(path: Path, data: bytes) -> _Header:
 
 def _packed(data: bytes, lines: int, count: int) -> Floats | None:
     """Lines whose components are packed one by one; None for damage."""
-    if len(data) < lines * (4 + 8 * -(-count // 127)):
+    start = bytes([2, 2, count >> 8, count & 255])
+    if not data.startswith(start) or len(data) < lines * (4 + 8 * -(-count // 127)):
         return None
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {lines} +X {count}\n".encode()
     level = cv2.utils.logging.setLogLevel(0)  # the error is reported here
@@ -117,10 +118,9 @@ def _packed(data: bytes, lines: int, count: int) -> Floats | None:
 def _flat(data: bytes, lines: int, count: int) -> Floats | None:
     """Pixels that are not packed; None for damage and the old packing, in which (1, 1, 1, n)
     repeats a pixel."""
-    rgbe = np.frombuffer(data[: 4 * lines * count], np.uint8)
-    if len(rgbe) < 4 * lines * count:
+    if len(data) != 4 * lines * count:
         return None
-    rgbe = rgbe.reshape(lines, count, 4)
+    rgbe = np.frombuffer(data, np.uint8).reshape(lines, count, 4)
     if (rgbe[..., :3] == 1).all(axis=-1).any():
         return None
     scale = np.where(rgbe[..., 3:] > 0, np.ldexp(1.0, rgbe[..., 3:].astype(int) - 136), 0)

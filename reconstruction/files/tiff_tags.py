@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +21,42 @@ _READ = {0, 1, 2, 3, 6, _MOSAIC}
 """PhotometricInterpretation: grey, RGB, palette, YCbCr, a mosaic."""
 _REQUIRED = {1: "WarpRectilinear", 2: "WarpFisheye", 3: "FixVignetteRadial", 9: "GainMap"}
 """Opcodes of DNG that change place or scale."""
-MOST_TAG = 1 << 16
+_NEEDED = {256, 257, 262}
+"""Width, height, PhotometricInterpretation."""
+MOST_TAG, MOST_PAGES = 1 << 16, 8
 Tags = Mapping[int, Any]
 
 
 def tags_of(path: Path, mosaic: bool = False) -> Tags:
     """Tags by number of the file's image, or of its full-size `mosaic`. Raises `ValueError` for
-    several images."""
+    several images and for missing tags or strips."""
     with tifffile.TiffFile(path) as file:
-        pages = [p for top in file.pages for p in (top, *(getattr(top, "pages", None) or ()))]
-        found = []
-        for page in pages:
-            tags = _tags(page)
-            if not int(tags.get(254, 0)) & 1 and (not mosaic or tags.get(262) == _MOSAIC):
-                found.append(tags)
-        first = _tags(pages[0])
-    if mosaic and not found:
-        raise ValueError(f"PhotometricInterpretation {first.get(262)}: expected a mosaic, 32803")
-    if not mosaic and (len(found) != 1 or int(first.get(254, 0)) & 1):
-        raise ValueError(f"{len(pages)} images: write one image in a file")
-    return {**first, **found[0]}
+        pages = [
+            page
+            for top in islice(file.pages, MOST_PAGES)  # a wrong offset leads to thousands
+            for page in (top, *islice(getattr(top, "pages", None) or (), MOST_PAGES))
+        ]
+        tagged = [_tags(page) for page in pages]
+        whole = [k for k, t in enumerate(tagged) if not int(t.get(254, 0)) & 1]
+        if mosaic:
+            whole = [k for k in whole if tagged[k].get(262) == _MOSAIC]
+            if not whole:
+                found = tagged[0].get(262)
+                raise ValueError(f"PhotometricInterpretation {found}: expected a mosaic, 32803")
+        elif whole != [0]:
+            raise ValueError(f"{len(pages)} images: write one image in a file")
+        page, tags = pages[whole[0]], tagged[whole[0]]
+        missing = [n for n in (_NEEDED | {277, 33422} if mosaic else _NEEDED) if n not in tags]
+        if missing:
+            raise ValueError(f"TIFF tag {missing[0]} is missing or damaged: write the file anew")
+        if len(page.dataoffsets) != np.prod(page.chunked):
+            raise ValueError(f"{len(page.dataoffsets)} strips, expected {np.prod(page.chunked)}")
+    return {**tagged[0], **tags}
 
 
 def tiff_values(tags: Tags, values: Any) -> tuple[Any, float | None, Colour]:
     """`values` with white high, the white of fewer bits than the type's, and their colour."""
-    kind = int(tags.get(262, 1))
+    kind = int(tags[262])
     if kind not in _READ:
         raise ValueError(f"PhotometricInterpretation {kind}: write RGB or grey")
     whole = np.issubdtype(values.dtype, np.integer)
@@ -77,6 +89,9 @@ def dng_levels(path: Path, shape: tuple[int, int], colours: Any) -> tuple[Array,
     tags, (height, width) = tags_of(path, mosaic=True), shape
     for code in (51008, 51009, 51022):
         _check_opcodes(code, tags.get(code, b""))
+    bits, mosaic = _numbers(tags, 258, ()), tags[33422]
+    if len(bits) != 1 or not 8 <= bits[0] <= 16 or set(mosaic) - {0, 1, 2}:
+        raise ValueError(f"BitsPerSample {bits}, CFAPattern {list(mosaic)}: expected 8 to 16, RGB")
     rows, columns = (int(n) for n in _numbers(tags, 50713, (1, 1)))
     level = np.array(_numbers(tags, 50714, (0,) * (rows * columns)))
     across, down = (np.array(_numbers(tags, code, ())) for code in (50715, 50716))
@@ -90,7 +105,7 @@ def dng_levels(path: Path, shape: tuple[int, int], colours: Any) -> tuple[Array,
     black = np.tile(level.reshape(rows, columns), (-(-height // rows), -(-width // columns)))
     black = black[:height, :width] + (across if len(across) else 0)
     black = black + (down[:, None] if len(down) else 0)
-    white = np.array(_numbers(tags, 50717, (2.0 ** min(int(np.max(tags.get(258, 16))), 32) - 1,)))
+    white = np.array(_numbers(tags, 50717, (2 ** bits[0] - 1,)))
     if len(white) not in (1, 3, 4):
         raise ValueError(f"WhiteLevel has {len(white)} values: expected 1, 3 or 4")
     by_colour = white if len(white) == 4 else np.resize(np.append(white, white[1:2]), 4)

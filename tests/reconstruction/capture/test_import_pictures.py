@@ -20,7 +20,6 @@ from reconstruction import Capture, CaptureWriter, import_folder, verify, write_
 from reconstruction.arrays import Floats
 from reconstruction.capture.contact_sheet import contact_sheet
 from reconstruction.capture.import_folder import Import, ImportProblem, settings_of
-from reconstruction.files.masks import decode_mask
 from reconstruction.files.pictures import PictureError, Sensor, read_picture
 from reconstruction.images.silhouettes import silhouette
 from stage_service.cli import main
@@ -149,12 +148,12 @@ def test_floats_above_1_are_light_and_not_saturated(tmp_path):
 
 
 def test_layered_exr_is_distinguished_from_a_broken_one(tmp_path):
-    """Blender's multilayer files have no plain R, G and B: copying them anew was no help."""
+    """Of two layers of colours none is the image; copying them anew is no help."""
     path, layer = tmp_path / "a.exr", np.ones((SIZE, SIZE), np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channels = {f"ViewLayer.Combined.{c}": layer for c in "RGB"}
+    channels = {f"{n}.{c}": layer for n in ("Combined", "Diffuse") for c in "RGB"}
     OpenEXR.File(header, channels).write(str(path))
-    with pytest.raises(PictureError, match=r"got ViewLayer\.Combined.*: write .* as RGB") as caught:
+    with pytest.raises(PictureError, match=r"got Combined\.B.*: write .* as RGB") as caught:
         read_picture(path, Sensor(), (SIZE, SIZE))
     assert "copy it again" not in str(caught.value)
 
@@ -203,23 +202,19 @@ HALF_TURN = np.frombuffer(
 """EXIF whose orientation is 3: a viewer shows the picture upside down."""
 
 
-def test_exif_rotation_is_ignored(folder, tmp_path):
-    """EXIF turned AVIF and masks by a half, and left PNG, TIFF and JPEG as they were."""
+def test_exif_rotation_is_as_the_setting(tmp_path):
+    """In a square image it may be meant or not: the user states it."""
     stored = np.zeros((SIZE, SIZE, 3), np.uint8)
     stored[4:10, 2:8] = 255
     for name in ("turned.avif", "turned.png", "turned.jpg"):
         kinds = [cv2.IMAGE_METADATA_EXIF]
         cv2.imwriteWithMetadata(str(tmp_path / name), stored, kinds, [HALF_TURN])
-        light = read_picture(tmp_path / name, Sensor(), (SIZE, SIZE)).light
-        np.testing.assert_array_equal(light > 0.5, stored > 0, err_msg=name)
-    everywhere(lambda c, n, x: save(folder / f"images/{c}/light_{n:03d}.png", srgb(x), np.uint8))
-    (folder / "masks").mkdir()
-    (tmp_path / "turned.png").rename(folder / "masks/left.png")
-    hair, _ = Import.of(folder).masks("left")
-    assert hair is not None
-    np.testing.assert_array_equal(hair, stored[..., 0] > 0)
-    again = decode_mask((folder / "masks/left.png").read_bytes(), SIZE, SIZE)
-    np.testing.assert_array_equal(again, hair)
+        for orientation, expected in (("stored", stored), ("turned", stored[::-1, ::-1])):
+            sensor = Sensor(orientation=orientation)
+            light = read_picture(tmp_path / name, sensor, (SIZE, SIZE)).light
+            np.testing.assert_array_equal(light > 0.5, expected > 0, err_msg=name)
+        with pytest.raises(PictureError, match=r'orientation 3 .*orientation = "stored"'):
+            read_picture(tmp_path / name, Sensor(), (SIZE, SIZE))
 
 
 def test_brackets_are_merged_and_saturation_is_kept(folder, tmp_path):

@@ -116,7 +116,10 @@ def of_dng(path: Path) -> int:
 
 def dng_by_tifffile(path: Path) -> Any:
     with tifffile.TiffFile(path) as file:
-        tags = {t.code: t.value for t in file.pages[0].tags}
+        tags = {
+            t.code: np.divide(t.value[::2], t.value[1::2]) if t.dtype in (5, 10) else t.value
+            for t in file.pages[0].tags
+        }
         counts = file.pages[0].asarray().astype(float)
     rows, columns = np.atleast_1d(tags.get(50713, (1, 1)))
     black = np.resize(np.atleast_1d(tags.get(50714, 0)), (rows, columns))
@@ -154,26 +157,30 @@ def test_a_wrong_header_never_changes_the_light_silently(suffix, count, tmp_path
     whole = path.read_bytes()
     first = ours(path)
     np.testing.assert_allclose(first, reference(path), atol=2e-3)
-    pixels = H * W * 6 if suffix == "tif" else 0  # tags lie before and after the values
-    start = struct.unpack_from("<I", whole, 4)[0] if suffix in ("tif", "dng") else 0
+    start, end, offset = 0, length, -12
+    if suffix in ("tif", "dng"):  # where the pixels are is no statement about them
+        start = struct.unpack_from("<I", whole, 4)[0]
+        end, offset = min(length, start + 1000), whole.index(struct.pack("<H", 273), start)
+    places = [at for at in range(start, end) if not offset <= at < offset + 12]
     for _ in range(count):
         data = bytearray(whole)
-        for _ in range(rng.integers(1, 3)):
-            at = int(rng.integers(start, min(length, start + 1000) if pixels else length))
+        for at in rng.choice(places, rng.integers(1, 3)):
             data[at] = rng.choice([rng.integers(256), data[at] ^ (1 << rng.integers(8))])
         path.write_bytes(data)
         try:
             found = ours(path)
         except (PictureError, ValueError):
             continue
+        if found.size > 1e6:
+            continue  # an import compares the size with the camera's
         try:
             expected = reference(path)
         except Exception:  # it cannot read the file: only the original light is right
             expected = None
-        right = [x for x in (expected, first) if x is not None and x.shape == found.shape]
-        if expected is not None:
-            right = right[:1]
-        if not any(np.allclose(found, x, rtol=0.01, atol=2e-3, equal_nan=True) for x in right):
+        if expected is None or expected.shape != found.shape:
+            expected = first
+        same = found.shape == expected.shape
+        if not (same and np.allclose(found, expected, rtol=0.01, atol=2e-3, equal_nan=True)):
             changed = [(i, whole[i], data[i]) for i in range(len(data)) if data[i] != whole[i]]
-            silent.append((changed, found.shape, None if expected is None else expected.shape))
-    assert silent == []
+            silent.append((changed, found.shape))
+    assert not silent, silent
