@@ -151,10 +151,10 @@ def _pixels(path: str | Path, number: int, names: list[str]) -> AnyFloats:
     """R, G and B `(h, w, 3)` of the data window of a part."""
     if names == ["R", "G", "B"]:
         with suppress(Exception):  # faster; fails for mixed channel types
-            found = OpenEXR.File(str(path)).parts[number].channels
+            found = OpenEXR.File(str(path)).channels(number)
             return np.asarray(found["RGBA" if "RGBA" in found else "RGB"].pixels[..., :3])
     try:
-        found = OpenEXR.File(str(path), separate_channels=True).parts[number].channels
+        found = OpenEXR.File(str(path), separate_channels=True).channels(number)
         pixels = [found[name].pixels for name in names]
         steps = [(found[name].xSampling, found[name].ySampling) for name in names]
     except Exception as error:  # the binding raises RuntimeError and MemoryError

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from reconstruction.arrays import Array, Floats
 from reconstruction.containment import plain_file
@@ -65,7 +65,7 @@ def _header(path: Path, data: bytes) -> _Header:
     match = re.search(rb"\r?\n\r?\n", data)
     found = _SIZE.match(data, match.end()) if match and data.startswith(b"#?") else None
     if match is None or found is None:
-        raise ValueError(f"{path}: not a Radiance .hdr image: it has no size")
+        raise ValueError(f"{path}: cannot be read as a Radiance .hdr image: it has no size")
     first, one, rows, second, other, columns = (x.decode() for x in found.groups())
     if {one, other} != {"X", "Y"}:
         raise ValueError(f"{path}: {found[0].decode().strip()!r}: expected X and Y")
@@ -103,16 +103,24 @@ def _header(path: Path, data: bytes) -> _Header:
 
 def _packed(data: bytes, lines: int, count: int) -> Floats | None:
     """Lines whose components are packed one by one; None for damage."""
-    start = bytes([2, 2, count >> 8, count & 255])
-    if not data.startswith(start) or len(data) < lines * (4 + 8 * -(-count // 127)):
+    start, at, out = bytes([2, 2, count >> 8, count & 255]), 0, bytearray()
+    if len(data) < lines * (4 + 8 * -(-count // 127)):
         return None
-    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {lines} +X {count}\n".encode()
-    level = cv2.utils.logging.setLogLevel(0)  # the error is reported here
-    try:
-        image = cv2.imdecode(np.frombuffer(head + data, np.uint8), cv2.IMREAD_UNCHANGED)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    return None if image is None else np.asarray(image[..., ::-1], np.float32)
+    for number in range(4 * lines):
+        if number % 4 == 0:
+            if data[at : at + 4] != start:
+                return None
+            at += 4
+        end = len(out) + count
+        while len(out) < end:
+            n = data[at] if at < len(data) else 0
+            if n == 0:
+                return None
+            out += data[at + 1 : at + 2] * (n - 128) if n > 128 else data[at + 1 : at + 1 + n]
+            at += 2 if n > 128 else 1 + n
+        if len(out) != end:
+            return None
+    return _floats(np.frombuffer(out, np.uint8).reshape(lines, 4, count).transpose(0, 2, 1))
 
 
 def _flat(data: bytes, lines: int, count: int) -> Floats | None:
@@ -123,5 +131,9 @@ def _flat(data: bytes, lines: int, count: int) -> Floats | None:
     rgbe = np.frombuffer(data, np.uint8).reshape(lines, count, 4)
     if (rgbe[..., :3] == 1).all(axis=-1).any():
         return None
+    return _floats(rgbe)
+
+
+def _floats(rgbe: NDArray[np.uint8]) -> Floats:
     scale = np.where(rgbe[..., 3:] > 0, np.ldexp(1.0, rgbe[..., 3:].astype(int) - 136), 0)
     return np.asarray(rgbe[..., :3] * scale, np.float32)
