@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name, plain_file
 from reconstruction.files.cameras.errors import CameraFile, CameraFileError, camera_of
-from reconstruction.files.pictures import FORMATS, picture_size
+from reconstruction.files.encoded import FORMATS
+from reconstruction.files.pictures import picture_size
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lens_models import LensModel
 
