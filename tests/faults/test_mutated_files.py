@@ -51,4 +51,4 @@ def test_some_damaged_files(tmp_path):
 def test_a_thousand_damaged_files(name, tmp_path, capsys):
     found = mutated([name], 1000, tmp_path)[name]
     with capsys.disabled():
-        print(f"\n{name}: {found['told']}, {found['peak_bytes'] >> 20} MiB at most")
+        print(f"\n{name}: {found['outcomes']}, {found['peak_bytes'] >> 20} MiB at most")
