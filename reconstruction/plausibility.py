@@ -124,7 +124,7 @@ def check_face(strands: Strands, head: Mesh, stage: Stage) -> None:
     scalp = head.vertices[np.unique(head.faces[head.scalp])]
     upper = head.vertices[head.vertices[:, 2] > top - 0.22]
     forward = np.append((upper.mean(axis=0) - scalp.mean(axis=0))[:2], 0.0)
-    if not np.linalg.norm(forward) > 5e-3:  # metres: the scalp tells no front
+    if not np.linalg.norm(forward) > 5e-3:  # metres: the scalp has no front
         return
     forward /= np.linalg.norm(forward)
     low, high = top - 0.22, top - 0.12  # from the chin to the eyes

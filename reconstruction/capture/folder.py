@@ -32,6 +32,7 @@ from reconstruction.capture.records import (
     Step,
     StepKind,
     read_journal,
+    read_object,
     read_steps,
 )
 from reconstruction.capture.stray_light import stray_light
@@ -43,7 +44,6 @@ from reconstruction.geometry.lens import Lens
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig, counted
 from reconstruction.geometry.world_frame import WorldFrame
-from reconstruction.reading import read_json
 
 T = TypeVar("T")
 Pixels = tuple[Floats, Bools]
@@ -64,7 +64,7 @@ class Capture:
             )
         try:
             self.rig = Rig.load(self._own("rig.json"))
-            self.plan: dict[str, Any] = _object(self._own("plan.json"))
+            self.plan: dict[str, Any] = read_object(self._own("plan.json"))
             self.steps = read_steps(self.plan)
             self.records = read_journal(self._own("journal.jsonl"))
         except (OSError, ValueError) as error:
@@ -163,7 +163,7 @@ class Capture:
     def manifest(self) -> dict[str, Any] | None:
         """The manifest, None before the capture is finished. Raises `CaptureError`."""
         path = self._own("manifest.json")
-        return _object(path) if path.exists() else None
+        return read_object(path) if path.exists() else None
 
     def has(self, step: Step, camera: str) -> bool:
         """Whether the frame was written."""
@@ -394,14 +394,3 @@ class Capture:
     def _shape(self, camera: str) -> tuple[int, int]:
         c = self.rig.camera(camera)
         return c.height, c.width
-
-
-def _object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file of a capture."""
-    try:
-        data = read_json(path)
-    except (OSError, ValueError) as error:
-        raise CaptureError(str(error)) from error
-    if not isinstance(data, dict):
-        raise CaptureError(f"{path}: expected an object, got {type(data).__name__}")
-    return data

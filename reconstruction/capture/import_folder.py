@@ -36,13 +36,12 @@ from reconstruction.capture.import_frames import (
     read_user_mask,
 )
 from reconstruction.capture.import_geometry import Geometry
+from reconstruction.capture.import_matching import Found, find
 from reconstruction.capture.import_origin import Origin
 from reconstruction.capture.import_settings import (
     SETTINGS,
-    Found,
     ImportProblem,
     ImportSettings,
-    find,
     read_settings,
 )
 from reconstruction.capture.import_tables import (

@@ -13,7 +13,8 @@ import numpy as np
 from reconstruction.arrays import Bools, Floats
 from reconstruction.capture.exposures import BackgroundPixels, Merged, flattened, merge
 from reconstruction.capture.grey_ball import PlacedBall, Scale
-from reconstruction.capture.import_settings import Bracket, Found, ImportProblem, ImportSettings
+from reconstruction.capture.import_matching import Bracket, Found
+from reconstruction.capture.import_settings import ImportProblem, ImportSettings
 from reconstruction.capture.likely_lights import likely_strength
 from reconstruction.capture.records import Step
 from reconstruction.files.encoded import PictureError

@@ -18,7 +18,8 @@ import numpy as np
 
 from reconstruction.arrays import Array
 from reconstruction.capture.import_geometry import Geometry
-from reconstruction.capture.import_settings import Found, ImportSettings
+from reconstruction.capture.import_matching import Found
+from reconstruction.capture.import_settings import ImportSettings
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with_fully_lit
 from reconstruction.capture.records import Step, StepKind
 from reconstruction.containment import plain_file

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from reconstruction.containment import plain_file
-from reconstruction.reading import parse_json
+from reconstruction.reading import parse_json, read_json
 
 StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
 
@@ -111,3 +111,14 @@ def read_journal(path: Path) -> dict[tuple[int, str], FrameRecord]:
             if number < len(lines):
                 raise CaptureError(f"{path}, line {number}: {error}") from error
     return out
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file of a capture. Raises `CaptureError`."""
+    try:
+        data = read_json(path)
+    except (OSError, ValueError) as error:
+        raise CaptureError(str(error)) from error
+    if not isinstance(data, dict):
+        raise CaptureError(f"{path}: expected an object, got {type(data).__name__}")
+    return data

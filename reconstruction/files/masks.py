@@ -61,7 +61,7 @@ def decode_mask(data: bytes, width: int, height: int) -> Bools:
     if image is None or image.shape != (height, width):
         raise ValueError(f"{expected}, got a damaged file")
     if (turn := exif_orientation(png_chunks(data).get(b"eXIf", b""))) != 1:
-        raise ValueError(f"EXIF orientation {turn}: write the mask in the camera's pixels, without")
+        raise ValueError(f"EXIF orientation {turn}: write the mask in the camera's pixels")
     mask = half_grey(image)
     if data[_COLOUR_TYPE] in _MAYBE_TRANSPARENT:
         check_alpha(data, mask)

@@ -65,7 +65,7 @@ def read_ies(
     if multiplier == 0:
         raise numbers.wrong(
             f"the factors of an edition of {version} multiply all candela values by 0; if the file "
-            "is of 2002 or later, its first line must say so: IESNA:LM-63-2002"
+            "is of 2002 or later, its first line must be IESNA:LM-63-2002"
         )
     numbers.take("input watts")
     if tilt is not None:

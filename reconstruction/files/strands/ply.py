@@ -1,6 +1,6 @@
 """Reading strands of `.ply` files, as the neural methods write them: vertices, strand by strand.
 
-A PLY has no strands. Their ends are, in this order: where no edge goes on from a vertex to the
+A PLY has no strands. Their ends are, in this order: where no edge leads from a vertex to the
 next; where the number of the strand or the colour changes, one for each strand; where the step to
 the next vertex is `GAP` times its neighbours, for strands of the same number of points.
 """
