@@ -153,7 +153,10 @@ class TinyStage:
     def pipeline(**options: Any) -> dict[str, Any]:
         """The whole pipeline at a quality for pictures of 24 pixels."""
         quality = {
-            "reconstruct": {"roots": 2000, "grid": 4e-3, "within": 0.05},
+            "reconstruct": {
+                **{"roots": 2000, "grid": 4e-3, "within": 0.05},
+                "measure": {"bank": {"wavelength": 6.0, "count": 24, "spread": 1.5}},
+            },
             "fit": {"iterations": 2},
             "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
         }

@@ -53,7 +53,7 @@ def test_frames_are_requested_by_any_camera_name(run):
         await relight.showSum({json.dumps(name)}, {{}});"""
     )
     parts = urlsplit(requested)
-    assert unquote(parts.path) == f"/view/models/m/sums/{name}.png"
+    assert unquote(parts.path) == f"view/models/m/sums/{name}.png"
     assert (parts.query, parts.fragment) == ("", "")
 
 
