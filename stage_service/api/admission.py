@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from email.utils import formatdate
 from http import HTTPStatus
@@ -17,14 +18,19 @@ from stage_service.api.problems import problem_response
 from stage_service.api.throttle import Throttled
 from stage_service.web.headers import INERT
 
+AT_ONCE, AT_ONCE_PER_S = 40.0, 20.0
+"""Connections of one caller who may steer that are admitted at once, and how many more a second. A
+browser opens 6."""
+
 
 class Admission:
-    """Judges connections. Callers who may steer and requests that darken are admitted at once,
-    others in turn while their owner has a place or needs none. `running()` is the id of the running
-    capture."""
+    """Judges connections. Requests that darken are admitted at once, and so are the first of a
+    caller who may steer (`AT_ONCE`); others in turn while their owner has a place or needs none,
+    and the hall has room. `running()` is the id of the running capture."""
 
     def __init__(self, access: Access, hall: Hall, running: Callable[[], str | None]) -> None:
         self._access, self._hall, self._running = access, hall, running
+        self._left: dict[Owner, tuple[float, float]] = {}
 
     def judge(self, head: bytes, address: str) -> Verdict:
         """The verdict on a connection that begins with `head`, empty if it is encrypted."""
@@ -39,10 +45,18 @@ class Admission:
         express = stops or EXPRESS.fullmatch(request) is not None
         return Verdict(
             owner,
-            at_once=owner.steers or (stops and identity is not None),
-            may=lambda: express or self._hall.lacks(owner) is None,
+            at_once=identity is not None and (stops or (owner.steers and self._first(owner))),
+            may=lambda: express or (self._hall.lacks(owner) is None and not self._hall.crowded),
             refusal=lambda: self._refusal(owner, path),
         )
+
+    def _first(self, owner: Owner) -> bool:
+        """Whether the caller is within `AT_ONCE`; counts the connection."""
+        now = time.monotonic()
+        left, since = self._left.get(owner, (AT_ONCE, now))
+        left = min(AT_ONCE, left + AT_ONCE_PER_S * (now - since))
+        self._left[owner] = max(left - 1, 0.0), now
+        return left >= 1 and not self._hall.crowded
 
     def _refusal(self, owner: Owner, path: str) -> bytes:
         """A complete response, 429 or 503."""

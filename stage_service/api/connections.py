@@ -63,6 +63,11 @@ class Hall:
         lacks = self._places.lacks("connections", owner)
         return lacks if not any(c.idle for c in self._of(owner)) else None
 
+    @property
+    def crowded(self) -> bool:
+        """Whether half of its room is taken."""
+        return 2 * len(self._inside) >= self._most
+
     def _of(self, owner: Owner) -> Iterator[Connection]:
         return (c for c in self._owned if c.owner == owner)
 

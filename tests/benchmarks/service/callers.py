@@ -62,6 +62,7 @@ HEAD = (
     "blackout, s: median, worst",
     "said",
     "page: lost streams, longest silence, failed looks",
+    "operator's requests sent again",
     "answers",
 )
 
@@ -194,6 +195,7 @@ def _cell(live: Live, load: str, capture: str, token: str, pairs: int) -> dict[s
     with_it: list[float] = []
     without: list[float] = []
     blackouts: dict[str, list[tuple[float, str]]] = {name: [] for name in FAULTS}
+    resent = live.resent
     with Page(live) as page:
         crowd = _Load(load, live, capture, token)
         for pair in range(pairs):
@@ -222,6 +224,7 @@ def _cell(live: Live, load: str, capture: str, token: str, pairs: int) -> dict[s
             "failed": page.failed,
             "looks": page.looks,
         },
+        "resent": live.resent - resent,
         "answers": crowd.responses,
     }
 
@@ -304,6 +307,7 @@ def _row(cell: dict[str, Any]) -> tuple[object, ...]:
         shown,
         ", ".join(sorted({said for _, _, said in found})),
         f"{page['lost']}, {page['slowest_look_s']:.2f} s, {page['failed']} of {page['looks']}",
+        cell["resent"],
         ", ".join(f"{k}: {v}" for k, v in sorted(cell["answers"].items())),
     )
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import httpx
 
@@ -59,7 +60,7 @@ class Live:
         more: Sequence[str] = (),
     ) -> None:
         self.rig, self.root, self._children, self._more = rig, root, children, more
-        self.kills = 0
+        self.kills = self.resent = 0
         self.begin(command)
 
     def words(self, root: Path) -> list[str]:
@@ -99,14 +100,25 @@ class Live:
         self.child.wait(HURRY_S)
 
     def call(self, method: str, path: str, body: Any = None) -> Any:
-        """The response's JSON; after a 503 the request is sent once more, as its header says.
+        """The response's JSON; after a 503, as its header says, or a lost connection the request is
+        sent again, four times at most, counted in `resent`.
 
-        Raises `httpx.HTTPStatusError`.
+        Raises `httpx.HTTPStatusError`, `httpx.TransportError`.
         """
-        response = self.http.request(method, path, json=body)
-        if response.status_code == httpx.codes.SERVICE_UNAVAILABLE:
-            time.sleep(float(response.headers.get("retry-after", 1)))
-            response = self.http.request(method, path, json=body)
+        headers = {"Idempotency-Key": uuid4().hex} if method == "POST" else {}
+        for left in (4, 3, 2, 1, 0):
+            try:
+                response = self.http.request(method, path, json=body, headers=headers)
+            except httpx.TransportError:
+                if not left:
+                    raise
+                pause = 0.1
+            else:
+                if response.status_code != httpx.codes.SERVICE_UNAVAILABLE or not left:
+                    break
+                pause = float(response.headers.get("retry-after", 1))
+            self.resent += 1
+            time.sleep(pause)
         return response.raise_for_status().json()
 
     def until_done(self, capture: str) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from waiting import until
 
 from reconstruction import Model, Strands
 from stage_service.api import bodies, connections, porch, throttle
+from stage_service.api.admission import AT_ONCE, Admission
 from stage_service.api.gate import Access
 from stage_service.api.places import LIMITS, Kind, NoPlace, Owner, Places
 from stage_service.api.throttle import Throttle, Throttled
@@ -337,3 +338,22 @@ def test_a_token_s_own_connections_that_wait_make_room_for_its_next(callers, lim
     assert {status(link) for link in held} == {200}
     fourth = callers.open("reader", "GET /health")
     assert status(fourth) == 200
+
+
+def test_a_flood_of_those_who_steer_waits_in_turn_but_for_blackouts(tmp_path: Any) -> None:
+    tokens = Tokens(tmp_path / "tokens.json")
+    known = {name: tokens.make(name, ("read", "steer")) for name in ("ada", "bob")}
+    hall = connections.Hall(Places())
+    admission = Admission(Access(tokens), hall, lambda: None)
+
+    def at_once(what: str, name: str) -> bool:
+        own = f"Authorization: Bearer {known[name]}\r\n" if name else ""
+        head = f"{what} HTTP/1.1\r\nHost: localhost\r\n{own}\r\n"
+        return admission.judge(head.encode(), "127.0.0.1").at_once
+
+    flood = [at_once("GET /captures/a/archive.tar", "ada") for _ in range(1000)]
+    assert all(flood[: int(AT_ONCE)])
+    assert sum(flood) < 3 * AT_ONCE  # and some while the others were judged
+    assert at_once("POST /devices/blackout", "ada")
+    assert at_once("GET /health", "bob")
+    assert not at_once("GET /health", "")
