@@ -123,10 +123,10 @@ class GrowingStages(Stages):
                 options=asdict(o),
             )
             if result.dropped:
-                consequence = "were removed" if reached else "no strand is rooted"
+                consequence = "and were removed" if reached else "so that no strand is rooted"
                 stage.warn(
                     f"{result.dropped} of {len(rooted) + len(loose)} strands could not be "
-                    f"connected to the scalp: {consequence}"
+                    f"connected to the scalp, {consequence}"
                 )
         return Grown(strands, reached)
 

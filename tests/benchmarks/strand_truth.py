@@ -92,7 +92,7 @@ class StrandTruth:
     def __init__(
         self, capture: Capture, folder: Path, ball: Ball | None = None, samples: int = 40_000
     ) -> None:
-        whole = read_strands(folder / "strands.npz")
+        self.whole = whole = read_strands(folder / "strands.npz")
         self._capture, self._ball, self._samples = capture, ball, samples
         self.strands = whole if ball is None else ball.cut(whole)
         self._visibility = Visibility(capture.rig.cameras, whole, capture.head)

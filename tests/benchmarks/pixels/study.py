@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 from typing import Any
 
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, option, within
 from benchmarks.pictures import picture_strands
 from benchmarks.pixels.rig import PITCHES, SUBJECTS, TUNING, patch_capture
 from benchmarks.results import save
-from benchmarks.strand_truth import Ball, StrandTruth, write_hair_masks
+from benchmarks.strand_truth import StrandTruth, write_hair_masks
 from reconstruction import (
     Capture,
     CaptureError,
@@ -97,13 +96,10 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
     progress("baselines", 0.95)
     model = Model(out / done[0])
     variants |= truth.baselines(model)
-    _picture(out, capture, truth, model, ball)
-    return variants
-
-
-def _picture(out: Path, capture: Capture, truth: StrandTruth, model: Model, ball: Ball) -> None:
-    sets = {"true": truth.strands, "reconstructed": ball.cut(model.strands())}
+    # whole: in the ball alone one would look at hair behind what the camera shows
+    sets = {"true": truth.whole, "reconstructed": model.strands()}
     picture_strands(out / "strands.png", capture.rig.cameras[0], sets)
+    return variants
 
 
 def table(results: dict[str, Any]) -> str:

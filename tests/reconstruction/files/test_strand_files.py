@@ -643,7 +643,7 @@ def test_a_thickness_of_0_is_a_tip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("less", [0, 1])
 def test_hair_without_a_header(less: int, tmp_path: Path) -> None:
-    """Points or segments (one less) for each strand; told by the file's size."""
+    """Points or segments (one less) for each strand, by the size of the file."""
     path, counts = tmp_path / "x.hair", np.array([3, 2, 4])
     xyz = np.random.default_rng(0).normal(size=(9, 3)).astype("<f4")
     raw = struct.pack("<2I", 3, 9) + (counts - less).astype("<u2").tobytes() + xyz.tobytes()
