@@ -15,8 +15,9 @@ import camera_writers as writers
 import cv2
 import numpy as np
 import pytest
+import users_cameras as readers
 from pxr import Usd, UsdGeom
-from scipy.spatial.transform import Rotation
+from users_cameras import Pixels
 
 from reconstruction import Camera, Capture, Model, Strands
 from reconstruction.geometry.mesh import Mesh
@@ -27,8 +28,6 @@ SIZE = 64
 AT = np.array([0.31, -0.22, 1.58])
 """Where the subject is in the user's world, metres with z up."""
 HEAD = Mesh(0.1 * np.eye(3), [[0, 1, 2]])
-Pixels = Callable[[np.ndarray], dict[str, np.ndarray]]
-"""Pixels by camera of points in the user's numbers."""
 
 
 def hair() -> Strands:
@@ -44,80 +43,32 @@ def stage(up: str, unit: float) -> list[Camera]:
     for k in range(5):
         a = 0.9 * k
         eye = AT + 0.9 * np.array([np.cos(a), np.sin(a), 0.3 * np.sin(2 * a)])
-        c = Camera.look_at(f"cam_{k}", SIZE, SIZE, eye, AT, 20)
+        c = Camera.look_at(f"{k + 1:02d}", SIZE, SIZE, eye, AT, 20)
         R = c.R @ turn
-        out.append(Camera(c.name, SIZE, SIZE, c.K, R, -R @ (turn.T @ eye) / unit))
+        t = -R @ (turn.T @ eye) / unit
+        out.append(Camera(c.name, SIZE, SIZE, c.K, R, t, distortion=writers.LENS))
     return out
 
 
-def pinhole(K: np.ndarray, R: np.ndarray, t: np.ndarray, points: np.ndarray) -> np.ndarray:
-    x = (points @ R.T + t) @ K.T
-    return x[:, :2] / x[:, 2:]
-
-
-def of_colmap(folder: Path, cameras: list[Camera]) -> Pixels:
-    writers.write_colmap_text(folder / "sparse", cameras)
-    rows = [x.split() for x in (folder / "sparse/images.txt").read_text().splitlines()[2::2]]
-    lens = [x.split() for x in (folder / "sparse/cameras.txt").read_text().splitlines()[1:]]
-    params = {x[0]: np.array(x[4:8], float) for x in lens}
-
-    def pixels(points: np.ndarray) -> dict[str, np.ndarray]:
-        out = {}
-        for row in rows:
-            fx, fy, cx, cy = params[row[8]]
-            w, x, y, z = map(float, row[1:5])
-            K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-            R, t = Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(row[5:8], float)
-            out[Path(row[9]).stem] = pinhole(K, R, t, points)
-        return out
-
-    return pixels
-
-
-def of_nerfstudio(folder: Path, cameras: list[Camera]) -> Pixels:
-    writers.write_transforms(folder / "transforms.json", cameras)
-    data = json.loads((folder / "transforms.json").read_text())
-
-    def pixels(points: np.ndarray) -> dict[str, np.ndarray]:
-        out = {}
-        for f in data["frames"]:
-            K = [[f["fl_x"], 0, f["cx"] - 0.5], [0, f["fl_y"], f["cy"] - 0.5], [0, 0, 1]]
-            to_camera = np.diag([1.0, -1, -1, 1]) @ np.linalg.inv(f["transform_matrix"])
-            name = Path(f["file_path"]).stem
-            out[name] = pinhole(np.array(K), to_camera[:3, :3], to_camera[:3, 3], points)
-        return out
-
-    return pixels
-
-
-def of_metashape(folder: Path, cameras: list[Camera]) -> Pixels:
-    """The writer's chunk has a rotation, a scale and a shift of its own: its world is the file's"""
-    writers.write_metashape(folder / "cameras.xml", cameras)
-    return lambda points: {c.name: pinhole(c.K, c.R, c.t, points) for c in cameras}
-
-
-def of_json(folder: Path, cameras: list[Camera]) -> Pixels:
+def write_json(path: Path, cameras: list[Camera]) -> None:
     entries = [
         {"id": c.name, "width": SIZE, "height": SIZE}
-        | {k: np.asarray(getattr(c, k)).tolist() for k in ("K", "R", "t")}
+        | {k: np.asarray(getattr(c, k)).tolist() for k in ("K", "R", "t", "distortion")}
         for c in cameras
     ]
-    (folder / "cameras.json").write_text(json.dumps({"cameras": entries}))
-    read = json.loads((folder / "cameras.json").read_text())["cameras"]
-
-    def pixels(points: np.ndarray) -> dict[str, np.ndarray]:
-        return {c["id"]: pinhole(*(np.array(c[k]) for k in ("K", "R", "t")), points) for c in read}
-
-    return pixels
+    path.write_text(json.dumps({"cameras": entries}))
 
 
-WORLDS = {
-    "colmap": (of_colmap, "mm", "-y"),
-    "colmap, metres": (of_colmap, "m", "z"),
-    "metashape": (of_metashape, "m", "y"),
-    "nerfstudio": (of_nerfstudio, 0.37, "z"),
-    "json": (of_json, "mm", "y"),
+World = tuple[Callable[[Path, list[Camera]], None], Callable[[Path], Pixels], str, str | float, str]
+WORLDS: dict[str, World] = {
+    "colmap": (writers.write_colmap_text, readers.of_colmap, "sparse", "mm", "-y"),
+    "colmap, metres": (writers.write_colmap_text, readers.of_colmap, "sparse", "m", "z"),
+    "metashape": (writers.write_metashape, readers.of_metashape, "cameras.xml", "m", "y"),
+    "easymocap": (writers.write_easymocap, readers.of_easymocap, "calib", "m", "-y"),
+    "nerfstudio": (writers.write_transforms, readers.of_nerfstudio, "transforms.json", 0.37, "z"),
+    "json": (write_json, readers.of_json, "cameras.json", "mm", "y"),
 }
+"""Writer, reader that shares nothing with us, file, unit and up axis."""
 
 
 def of_usd(path: Path) -> tuple[np.ndarray, float, str]:
@@ -144,12 +95,13 @@ def of_abc(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_exported_strands_lie_on_the_users_pictures(name: str, tmp_path: Path) -> None:
-    write, unit, up = WORLDS[name]
+    write, read, file, unit, up = WORLDS[name]
     metres = METRES.get(str(unit), unit)
     folder = tmp_path / "folder"
     folder.mkdir()
     cameras = stage(up, metres)
-    pixels = write(folder, cameras)
+    write(folder / file, cameras)
+    pixels = read(folder / file)
     turn = to_z_up(up)
     lights = [[float(x) for x in turn.T @ (AT + p) / metres] for p in (-np.eye(3), np.eye(3))[0]]
     rows = "".join(f"led_{k},{x},{y},{z}\n" for k, (x, y, z) in enumerate(lights))
