@@ -90,7 +90,7 @@ def check_subject(masked: MaskedCapture, hull: VoxelGrid, stage: Stage) -> None:
         text = (
             f"masks of the subject do not meet in space; share of a mask that the other cameras "
             f"confirm: {shares}; check the poses and that the images are those of their cameras "
-            "(exchanged cameras, mirrored axes or images)"
+            "(exchanged cameras, mirrored axes or images, a mirror or someone else in view)"
         )
         if 2 * len(off) > len(covered):
             raise CaptureError(text)

@@ -60,6 +60,11 @@ CAMERA_FILES = (
     *("intri.yml", "calib/intri.yml"),
 )
 LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".r3d")
+CONSTANT = (
+    "images under one light at a time are needed: sets under constant light (NeRSemble, "
+    "GaussianHaircut) cannot be used"
+)
 
 
 def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
@@ -72,6 +77,10 @@ def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
     if cameras is None and folder.is_dir() and not (folder / "cameras.json").is_file():
         cameras = next((p for n in CAMERA_FILES if (p := folder / n).exists()), None)
         if cameras is None:
+            if video := next((p for p in folder.rglob("*") if p.suffix.lower() in VIDEOS), None):
+                raise PlacementError(
+                    f"{video}: videos are not read: extract the frame of each light; {CONSTANT}"
+                )
             raise PlacementError(
                 f"{folder}: no file of cameras: give --cameras (a COLMAP folder, transforms.json, "
                 "a Metashape, OpenCV or EasyMocap file) or add cameras.json"
@@ -81,7 +90,7 @@ def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
         if lights is None:
             raise PlacementError(
                 f"{folder}: no file of lights: give --lights (.csv, .json, .npy or .obj of their "
-                "positions or directions) or add lights.json"
+                f"positions or directions) or add lights.json; {CONSTANT}"
             )
     return replace(given, cameras=cameras, lights=lights)
 

@@ -1,8 +1,10 @@
 """Layouts of public OLAT sets: frames, cameras and lights.
 
-FaceOLAT (github.com/prraoo/FaceOLAT) and HumanOLAT (github.com/TMT22/HumanOLAT), as their pages and
-tools describe them; tested on imitations only. All lights are on between single lights, so that
-the subject can be tracked; the numbers of these frames differ between takes by one or more.
+FaceOLAT (github.com/prraoo/FaceOLAT), HumanOLAT (github.com/TMT22/HumanOLAT) and OpenIllumination
+(huggingface.co/datasets/OpenIllumination/OpenIllumination, open_illumination.py), as their pages
+and tools describe them; tested on imitations only. In the first two all lights are on between
+single lights, so that the subject can be tracked; the numbers of these frames differ between takes
+by one or more.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, with
 from reconstruction.capture.records import Step, StepKind
 from reconstruction.containment import plain_file
 from reconstruction.files.cameras import CameraFile, read_cameras
+from reconstruction.files.cameras.nerfstudio import read_transforms
 from reconstruction.files.lights import LightFile, read_lights
 from reconstruction.files.pictures import Sensor, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
@@ -36,7 +39,9 @@ from reconstruction.geometry.placement import (
 )
 from reconstruction.reading import read_json
 
-Preset = Literal["faceolat", "humanolat"]
+Preset = Literal["faceolat", "humanolat", "openillumination"]
+PATTERNS = set(range(1, 14))
+"""Numbers of OpenIllumination's images under patterns of many lamps."""
 HATCH = (
     *(178, 179, 208, 209, 210, 237, 238, 239, 240, 267, 268, 269, 270, 271),
     *(295, 296, 297, 298, 319, 320, 321),
@@ -90,7 +95,8 @@ def read_preset(
     """
     if not files.folder.is_dir():
         raise PresetProblem(f"{files.folder}: no such folder")
-    return {"faceolat": _faceolat, "humanolat": _humanolat}[preset](files, mean, given)
+    readers = {"faceolat": _faceolat, "humanolat": _humanolat}
+    return (readers | {"openillumination": _openillumination})[preset](files, mean, given)
 
 
 def understood(take: Take) -> tuple[ImportSettings, Found]:
@@ -179,11 +185,67 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
     ]
     masks = {c: folder / "segmentations" / "masks" / "000" / f"{c}.png" for c in taken}
     return Take(
-        Geometry(_shot(geometry, taken), kept, [*geometry.notes, *notes]),
+        replace(
+            geometry, cameras=_shot(geometry, taken), lights=kept, notes=[*geometry.notes, *notes]
+        ),
         [*white, *frames],
         {c: p for c, p in masks.items() if p.is_file()},
         "srgb" if pictures.name == "images_processed" else "linear",
     )
+
+
+def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
+    """`OLAT/NAME`: `Lights/NNN/raw_undistorted/CAMERA.JPG`, whose light is row NNN of the set's
+    `light_pos.npy`; `output/transforms_*.json`; masks `output/obj_masks/CAMERA.png`.
+    """
+    folder = files.folder
+    tables = sorted((folder / "output").glob("transforms_*.json"))
+    lit = {int(p.name): p for p in sorted((folder / "Lights").glob("*")) if p.name.isdigit()}
+    shot = {n: {f.stem: f for f in (p / "raw_undistorted").glob("*")} for n, p in lit.items()}
+    if not tables or not any(shot.values()):
+        raise PresetProblem(
+            f"{folder}: expected output/transforms_train.json and Lights/000/raw_undistorted/A1.JPG"
+        )
+    if set(lit) == PATTERNS or folder.parent.name == "lighting_patterns":
+        raise PresetProblem(
+            f"{folder}: each image is lit by a pattern of many lamps, single lights are needed: "
+            "download the object with --light OLAT (20 of the 64 objects have it)"
+        )
+    lights = read_lights(_given(files.lights or _above(folder, "light_pos.npy"), "--lights FILE"))
+    if max(lit) >= len(lights.lights):
+        raise PresetProblem(
+            f"{folder}: Lights/{max(lit):03d} is beyond the {len(lights.lights)} lights of the file"
+        )
+    pictures = {name: path for taken in shot.values() for name, path in taken.items()}
+    cameras: dict[str, Camera] = {}
+    for table in tables:
+        data = read_json(table)
+        frames = data.get("frames") if isinstance(data, dict) else None
+        if not isinstance(frames, dict) or not all(isinstance(f, dict) for f in frames.values()):
+            raise PresetProblem(f"{table}: frames: expected an object by the cameras' names")
+        there = {c: picture_size(pictures[c]) for c in frames if c in pictures}
+        sized = {c: {**frames[c], "w": w, "h": h} for c, (w, h) in there.items()}
+        if sized:
+            read = read_transforms(table, {"frames": sized})
+            cameras |= {c.name: c for c in read.cameras}
+    where = replace(PlacementOptions(), **given)
+    geometry = _placed(CameraFile(list(cameras.values()), axes="opengl"), lights, where)
+    if where.unit == "m":
+        geometry.notes.append(f"{tables[0]} has no unit: m is assumed (--unit)")
+    names = [light.name for light in geometry.lights]
+    single = [
+        TakeFrame("olat", n, camera, path, names[n])
+        for n, taken in shot.items()
+        for camera, path in taken.items()
+        if camera in geometry.cameras
+    ]
+    masks = {c: folder / "output" / "obj_masks" / f"{c}.png" for c in cameras}
+    return Take(geometry, single, {c: p for c, p in masks.items() if p.is_file()})
+
+
+def _above(folder: Path, name: str) -> Path | None:
+    """The nearest file of that name above `folder`."""
+    return next((p / name for p in folder.resolve().parents[:3] if (p / name).is_file()), None)
 
 
 def _given(path: Path | None, example: str) -> Path:

@@ -62,7 +62,7 @@ def add(commands: Commands) -> None:
         choices=("opencv", "opengl"),
         help="if they differ from those of the format of --cameras",
     )
-    presets = ("faceolat", "humanolat")
+    presets = ("faceolat", "humanolat", "openillumination")
     imported.add_argument("--preset", choices=presets, help="layout of this published data set")
     imported.add_argument("--take", help="of --preset faceolat: ID20001")
 
@@ -131,6 +131,8 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     from reconstruction.geometry.placement import PlacementOptions
     from reconstruction.options import parse_options
 
+    if not args.folder.is_dir():
+        raise BadArgument(f"{args.folder}: no such folder: name the folder of the images")
     where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
     given = {f: value for f, value in where.items() if value is not None}
     if args.take is not None and args.preset != "faceolat":

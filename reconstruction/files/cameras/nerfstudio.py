@@ -39,9 +39,12 @@ _PLAIN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PER
 def read_transforms(path: Path, data: dict[str, Any]) -> CameraFile:
     """Cameras of a `transforms.json`; frames with the same pose and lens are one camera.
 
-    Raises `CameraFileError` naming the frame and the field.
+    `frames` may be an object by the cameras' names, as OpenIllumination's. Raises
+    `CameraFileError` naming the frame and the field.
     """
     frames = data["frames"]
+    if isinstance(frames, dict):
+        frames = [{**f, "file_path": k} for k, f in frames.items() if isinstance(f, dict)]
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise CameraFileError(f"{path}: frames: expected a list with at least one object")
     notes = [f"{path}: {text}" for key, text in _NOTED.items() if key in data]
