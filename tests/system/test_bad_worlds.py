@@ -35,6 +35,8 @@ OTHER = (([0.26, 0.0, 0.0], 0.09),)
 SIZE, GRID = 64, 5e-3
 HAIR_FROM = 0.02
 """Metres above the origin."""
+MIRROR = -0.2
+"""Metres along x at which the mirror stands."""
 
 
 @dataclass
@@ -48,6 +50,7 @@ class World:
     cameras: list[dict[str, Any]] = field(default_factory=list)
     lights: list[dict[str, Any]] = field(default_factory=list)
     distance: float = 0.9
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         self.rig = []
@@ -55,7 +58,7 @@ class World:
             a = 0.85 * k
             eye = [np.cos(a), np.sin(a), 0.5 * np.sin(1.7 * k)]
             eye = self.distance * np.array(eye)
-            width = 30 if self.balls is BALLS else 46
+            width = 30 if self.balls is BALLS and not self.mirror else 46
             self.rig.append(Camera.look_at(f"cam_{k}", SIZE, SIZE, eye, (0, 0, 0), width))
         self.lamps = [
             Light(f"led_{k}", p, np.ones(3)) for k, p in enumerate(dome_positions(48, 1.2, -60.0))
@@ -96,21 +99,37 @@ class World:
         return folder
 
     def hits(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points, normals `(H, W, 3)` and which pixels meet a ball."""
+        """Points, normals `(H, W, 3)` and which pixels meet a ball, also one in the mirror."""
         x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
         rays = camera.rays(np.stack([x, y], axis=-1))
-        depth, normal = np.full(x.shape, np.inf), np.zeros((*x.shape, 3))
+        direct = self._met(camera.center, rays)
+        if not self.mirror:
+            return direct
+        flip = np.array([-1.0, 1, 1])
+        reflected = self._met(camera.center * flip + [2 * MIRROR, 0, 0], rays * flip)
+        to_mirror = (MIRROR - camera.center[0]) / rays[..., :1]
+        at = camera.center + to_mirror * rays
+        framed = (to_mirror[..., 0] > 0) & (np.abs(at[..., 1:]) < 0.5).all(axis=-1)
+        instead = framed & (camera.center[0] > MIRROR) & ~direct[2] & reflected[2]
+        points, normals = (
+            np.where(instead[..., None], r, d)
+            for r, d in zip(reflected[:2], direct[:2], strict=True)
+        )
+        return points, normals, direct[2] | instead
+
+    def _met(self, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        depth, normal = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape)
         for center, radius in self.balls:
-            towards = self.scale * np.array(center) - camera.center
+            towards = self.scale * np.array(center) - eye
             along = rays @ towards
             inside = along**2 - (towards @ towards - (self.scale * radius) ** 2)
             t = along - np.sqrt(np.maximum(inside, 0))
-            nearer = (inside > 0) & (t < depth)
+            nearer = (inside > 0) & (t > 0) & (t < depth)
             depth[nearer] = t[nearer]
-            p = camera.center + t[..., None] * rays
+            p = eye + t[..., None] * rays
             normal[nearer] = ((p - self.scale * np.array(center)) / (self.scale * radius))[nearer]
         hit = np.isfinite(depth)
-        return camera.center + np.where(hit, depth, 0)[..., None] * rays, normal, hit
+        return eye + np.where(hit, depth, 0)[..., None] * rays, normal, hit
 
 
 @dataclass
@@ -263,6 +282,14 @@ def test_a_lit_wall_is_no_part_of_the_head(wall: float, tmp_path: Path, usual: O
     found = outcome(replace(World(), wall=wall).write(tmp_path / "folder"))
     assert found.litres == pytest.approx(usual.litres, rel=0.03)
     assert found.warnings == usual.warnings
+
+
+def test_what_a_mirror_shows_is_no_part_of_the_head(tmp_path: Path, usual: Outcome) -> None:
+    found = outcome(World(mirror=True).write(tmp_path / "folder"))
+    assert found.litres == pytest.approx(usual.litres, rel=0.05)
+    (doubt,) = [w for w in found.warnings if "do not meet in space" in w]
+    assert "cam_1 58%, cam_6 59%" in doubt
+    assert "a mirror" in doubt
 
 
 def test_strands_are_held_against_a_head() -> None:
