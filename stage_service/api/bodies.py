@@ -18,6 +18,9 @@ MOST_BODY, MOST_OTHERS = 1 << 20, 128 << 10
 Parsing 1 MB of JSON blocks the event loop for 10 ms."""
 BODY_S = 20.0
 """Deadline for a request's body."""
+MOST_VALUES = 10_000
+"""Values of a request, more than the weights of 1,000 lights have. Reporting 300,000 that are wrong
+blocks the event loop for 3 s."""
 MOST_UPLOAD, UPLOAD_S = 32 << 20, 120.0
 """Bytes of an upload, which is held in memory, and its deadline."""
 GRACE_S, FLOOR = 5.0, 8 << 10
@@ -97,10 +100,12 @@ def again(body: bytes, receive: Receive) -> Receive:
 
 
 def not_json(headers: Headers, body: bytes) -> str | None:
-    """Why a body of JSON or unnamed content type cannot be parsed; None if it can."""
+    """Why a body of JSON or unnamed content type is refused; None if it is not."""
     kind = headers.get("content-type", "json").partition(";")[0].strip().lower()
     if not body or not kind.endswith("json"):
         return None
+    if (values := body.count(b",") + 1) > MOST_VALUES:
+        return f"the body has {values:,} values, separated by commas, of at most {MOST_VALUES:,}"
     try:
         parse_json(body)
     except ValueError as error:

@@ -99,13 +99,12 @@ class Ranged(Response):
             await self._send(first, last, scope, send)
 
     async def _send(self, first: int, last: int, scope: Scope, send: Send) -> None:
-        """Send the bytes until the client has gone; without the scope `steer`, each part but the
-        first waits for a turn."""
-        connection, steers = connection_of(scope), _steers(scope)
+        """Send the bytes until the client has gone; each part but the first waits for a turn."""
+        connection, owner = connection_of(scope), owner_of(scope)
         throttle: Throttle = scope["app"].state.throttle
         more = False
         while first < last and not (connection is not None and connection.gone):
-            turn = await throttle.turn(patient=True) if more and not steers else Turn()
+            turn = await throttle.turn(owner, patient=True) if more else Turn()
             stop = min(first + CHUNK, last)
             try:
                 data = await to_thread.run_sync(self._read, first, stop, limiter=_readers(scope))

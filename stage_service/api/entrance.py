@@ -132,15 +132,13 @@ class _Held:
         self._kinds.append(kind)
 
     async def turn(self) -> None:
-        """Wait for a turn, unless the caller may steer. Raises `Throttled`."""
-        if not self.owner.steers:
-            with _parked(self._connection):
-                self._turn = await self._throttle.turn()
+        """Wait for a turn. Raises `Throttled`."""
+        with _parked(self._connection):
+            self._turn = await self._throttle.turn(self.owner)
 
     async def pause(self) -> None:
         """Wait between two parts of a body, of up to 64 KiB each, for a turn."""
-        if not self.owner.steers:
-            (await self._throttle.turn(patient=True)).end()
+        (await self._throttle.turn(self.owner, patient=True)).end()
 
     def sending(self, send: Send) -> Send:
         """`send`, which frees all but an upload's place when the response begins."""

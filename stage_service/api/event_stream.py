@@ -185,7 +185,7 @@ async def _follow(request: Request, number: int) -> AsyncIterator[bytes]:
             checked = clock()
             while (left := checked + LOOK_S - clock()) > 0:
                 much = not owner.steers and feed.pending(number, owner.steers) > FEW
-                turn = await throttle.turn(patient=True) if much else Turn()
+                turn = await throttle.turn(owner, patient=True) if much else Turn()
                 try:
                     number, text = await feed.after(number, left, owner.steers)
                 finally:

@@ -184,22 +184,44 @@ def test_a_place_that_is_given_back_goes_to_who_steers_first(limit):
 
 def test_while_a_capture_is_shot_work_of_others_is_done_one_piece_after_the_other(monkeypatch):
     monkeypatch.setattr(throttle, "WAIT_S", 0.01)
+    monkeypatch.setattr(throttle, "SHARE", 1e-6)
+    reader = Owner("reader")
 
     async def run() -> None:
         running = [True]
         found = Throttle(lambda: running[0])
-        first = await found.turn()
+        first = await found.turn(reader)
         with pytest.raises(Throttled, match="a capture is running"):
-            await found.turn()
+            await found.turn(Owner("another"))
         first.end()
         first.end()  # once
-        monkeypatch.setattr(throttle, "SHARE", 1e-6)
         # What it took is rested for, a million times as long.
-        (await found.turn(patient=True)).end()
         with pytest.raises(Throttled):
-            await found.turn()
+            await found.turn(reader)
         running[0] = False
-        (await found.turn()).end()
+        (await found.turn(reader)).end()
+
+    asyncio.run(run())
+
+
+def test_while_a_capture_is_shot_a_token_that_may_steer_has_a_credit(monkeypatch):
+    """32 connections of one delayed a blackout by 1 s, and a capture took four times as long."""
+    monkeypatch.setattr(throttle, "WAIT_S", 0.01)
+    monkeypatch.setattr(throttle, "OVERHEAD_S", throttle.CREDIT_S / 3.5)
+    monkeypatch.setattr(throttle, "STEERING_SHARE", 1e-3)
+    ada = Owner("ada", steers=True)
+
+    async def run() -> None:
+        found = Throttle(lambda: True)
+        for _ in range(2):
+            both = [await found.turn(ada), await found.turn(ada)]
+            with pytest.raises(Throttled):
+                await found.turn(ada)
+            for turn in both:
+                turn.end()
+        with pytest.raises(Throttled):
+            await found.turn(ada)
+        (await found.turn(Owner("eve", steers=True))).end()
 
     asyncio.run(run())
 
@@ -330,6 +352,9 @@ def test_large_bodies_are_refused_and_errors_are_short(callers):
     reported = callers.send("ada", "POST /plans:validate", content=wrong).json()
     assert len(reported["errors"]) <= 20
     assert len(reported["detail"]) < 4000
+    many = json.dumps({"lights": [[]] * 10_001}).encode()
+    reported = callers.send("ada", "POST /plans:validate", content=many).json()
+    assert reported["detail"].startswith("the body has 10,001 values")
 
 
 def test_a_token_s_own_connections_that_wait_make_room_for_its_next(callers, limit):
