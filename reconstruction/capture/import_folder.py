@@ -54,6 +54,7 @@ from reconstruction.capture.import_tables import (
 )
 from reconstruction.capture.likely_lights import LIKELY
 from reconstruction.capture.records import Step
+from reconstruction.capture.response_check import ResponseCheck, check_response
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.files.durable import write_whole
 from reconstruction.files.encoded import PictureError
@@ -97,7 +98,7 @@ class Import:
     `shot` are the cameras of the images, by name; `lenses` those of cameras whose images are
     undistorted, since a rig cannot store their lens model; `rig` is the capture's; `ball` is a grey
     ball. All of them, `head` and `scalp` (the text of scalp.obj) are relative to `origin`. Results
-    come back in the frame and unit `world` of the files.
+    come back in the frame and unit `world` of the files. `preset`: the layout is a published set's.
     """
 
     folder: Path
@@ -111,6 +112,7 @@ class Import:
     scalp: str | None = None
     origin: Origin = field(default_factory=Origin)
     world: WorldFrame = field(default_factory=WorldFrame)
+    preset: bool = False
 
     @classmethod
     def of(
@@ -140,6 +142,7 @@ class Import:
         check_metres(folder, given, "cameras" if own else "", of_lights)
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
+        preset = found is not None
         found = find(folder, settings, given) if found is None else found
         alone = notes_on_plates(found, settings.pictures.clean_plate)
         doubts = geometry.notes if own else []
@@ -165,7 +168,7 @@ class Import:
         return cls(
             folder, settings, rig, cameras, lenses, found, origin.head(head), ball,
             None if scalp is None else origin.obj(scalp), origin,
-            replace(world, origin=origin.stored),
+            replace(world, origin=origin.stored), preset,
         )  # fmt: skip
 
     @property
@@ -179,9 +182,18 @@ class Import:
         ]
 
     @cached_property
+    def response(self) -> ResponseCheck:
+        """The images' encoding, checked by fully lit frames, which are read."""
+        stated = self.settings.sensor.response is not None and not self.preset
+        return check_response(self._reader(self.settings), not stated)
+
+    @cached_property
     def frames(self) -> ImportedFrames:
         """The reader of the frames."""
-        return ImportedFrames(self.settings, self.shot, self.found, self.rig, self.ball)
+        return self._reader(replace(self.settings, sensor=self.response.sensor))
+
+    def _reader(self, settings: ImportSettings) -> ImportedFrames:
+        return ImportedFrames(settings, self.shot, self.found, self.rig, self.ball)
 
     def counts(self) -> dict[str, Any]:
         """What was recognised, as numbers."""
@@ -235,7 +247,8 @@ class Import:
         reader = self.frames
         subjects = reader.subjects(progress)
         masks = {n: read_user_mask(p, self.shot[n]) for n, p in self.found.hair.items()}
-        factor, notes = reader.light_factor, [*self.found.notes, *reader.ball_notes]
+        factor = reader.light_factor
+        notes = [*self.found.notes, *self.response.notes, *reader.ball_notes]
         if factor != 1:
             notes.append(
                 f"relative units: light intensities are multiplied by {factor:.3g}, so that the "

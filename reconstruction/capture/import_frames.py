@@ -61,11 +61,15 @@ class ImportedFrames:
         merged = merge({s: self._picture(p, camera) for s, p in bracket.items()}, scale)
         return flattened(merged, self._flats[camera]) if camera in self._flats else merged
 
-    def _picture(self, path: Path, camera: str) -> Picture:
-        shot = self.shot[camera]
+    def values(self, path: Path, camera: str) -> Picture:
+        """The values of a file, 1 at white, not decoded to light. Raises `ImportProblem`."""
+        return self._picture(path, camera, values_only=True)
+
+    def _picture(self, path: Path, camera: str, values_only: bool = False) -> Picture:
+        shot, sensor = self.shot[camera], self.settings.sensor
         aspect = float(shot.K[1, 1] / shot.K[0, 0])
         try:
-            return read_picture(path, self.settings.sensor, (shot.width, shot.height), aspect)
+            return read_picture(path, sensor, (shot.width, shot.height), aspect, values_only)
         except PictureError as error:
             raise ImportProblem(str(error)) from error
 

@@ -122,10 +122,28 @@ def exposure_of(path: Path) -> tuple[float, str]:
     return seconds, f"ISO {iso:g} f/{stop:.3g}"
 
 
-def read_picture(path: Path, sensor: Sensor, size: Size, aspect: float | None = None) -> Picture:
+def response_of(path: Path, sensor: Sensor) -> Curve:
+    """The curve by which `read_picture` decodes a file's values. Raises `PictureError`."""
+    if sensor.bayer is not None or path.suffix.lower() in RAW:
+        return "linear"
+    if sensor.response is not None or path.suffix.lower() == ".exr":
+        return sensor.response or "linear"
+    values, _, colour = stored_values(path)
+    return _curve(values, sensor, colour)
+
+
+def _curve(values: NDArray[Any], sensor: Sensor, colour: Colour) -> Curve:
+    curve: Curve | None = sensor.response if sensor.response is not None else colour.curve
+    return curve or ("srgb" if values.dtype == np.uint8 else "linear")
+
+
+def read_picture(
+    path: Path, sensor: Sensor, size: Size, aspect: float | None = None, values_only: bool = False
+) -> Picture:
     """Read an image of `size`, of a camera whose focal length in pixels down is `aspect` times that
-    across. Raises `PictureError` for another size, format or aspect, for damage, and for what the
-    file contains but cannot be read as light."""
+    across; `values_only`: the file's values, 1 at white, without curve, black level or primaries.
+    Raises `PictureError` for another size, format or aspect, for damage, and for what the file
+    contains but cannot be read as light."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise PictureError(f"{path}: unknown format; expected {' '.join(sorted(FORMATS))}")
@@ -136,6 +154,9 @@ def read_picture(path: Path, sensor: Sensor, size: Size, aspect: float | None = 
             f"{path}: pixelAspectRatio {place.aspect:.4g}, but fy / fx of the camera is "
             f"{aspect:.4g}: correct K, or the attribute"
         )
+    if values_only:
+        black = sensor.black if suffix in RAW else 0.0
+        sensor = replace(sensor, response="linear", black=black)
     if suffix == ".exr":
         picture = _exr(path, sensor)
     elif suffix in RAW:
@@ -144,7 +165,7 @@ def read_picture(path: Path, sensor: Sensor, size: Size, aspect: float | None = 
         values, white, colour = stored_values(path)
         if sensor.white is None and white is not None:
             sensor = replace(sensor, white=white)
-        picture = _counts(path, values, sensor, colour)
+        picture = _counts(path, values, sensor, Colour() if values_only else colour)
     return _turned_picture(picture, turn)
 
 
@@ -241,9 +262,7 @@ def _counts(path: Path, values: NDArray[Any], sensor: Sensor, colour: Colour) ->
     if infinite is not None and infinite.any():
         limit = min(limit, np.float32((np.finfo(np.float16).max - black) / (white - black)))
     saturated = np.asarray((share >= limit).any(axis=-1))
-    gamma: Curve | None = sensor.response if sensor.response is not None else colour.curve
-    if gamma is None:
-        gamma = "srgb" if values.dtype == np.uint8 else "linear"
+    gamma = _curve(values, sensor, colour)
     light = decoded(share, gamma)
     step = np.float32(1 / (white - black)) if whole else np.float32(0)
     quantum = decoded(share + step, gamma) - light if gamma != "linear" else step

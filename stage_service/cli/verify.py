@@ -93,6 +93,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.images.scene_checks import check_scene
 
     understood, notes = _understood(args)
+    notes += understood.response.notes
     for note in notes:
         output.note(note)
     if args.dry_run:

@@ -100,7 +100,7 @@ def test_radiance_is_the_balls(folder, tmp_path):
         assert image.sum() == pytest.approx(truth.sum(), rel=0.02)
     said = capture.plan["import"]
     assert not said["relative"]
-    (note,) = said["notes"]
+    _, note = said["notes"]
     assert note.startswith("grey ball: radius 30 mm at (0.060, 0.020, -0.010) m")
 
 

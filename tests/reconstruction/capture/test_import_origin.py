@@ -78,9 +78,11 @@ def test_a_subject_that_is_elsewhere_is_moved_to_the_origin(tmp_path: Path) -> N
     away = import_folder(folder(tmp_path / "away", AWAY.tolist()), tmp_path / "b")
     assert_same(still, away)
     frame = {"unit": 1.0, "up": "z", "origin": [0.0, 0.0, 0.0]}
-    assert still.plan["import"] == {"notes": [], "relative": False, "frame": frame}
+    (curve,) = still.plan["import"]["notes"]
+    assert "no fully lit frame" in curve
+    assert still.plan["import"] == {"notes": [curve], "relative": False, "frame": frame}
     assert away.plan["import"]["frame"] == {**frame, "origin": AWAY.tolist()}
-    (note,) = away.plan["import"]["notes"]
+    note, _ = away.plan["import"]["notes"]
     assert "the cameras look at (0.300, -0.200, 1.600) m" in note
     assert "were moved by (-0.300, 0.200, -1.600) m" in note
 
