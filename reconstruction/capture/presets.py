@@ -42,6 +42,7 @@ from reconstruction.reading import read_json
 Preset = Literal["faceolat", "humanolat", "openillumination"]
 PATTERNS = set(range(1, 14))
 """Numbers of OpenIllumination's images under patterns of many lamps."""
+SRGB = Sensor(response="srgb")
 HATCH = (
     *(178, 179, 208, 209, 210, 237, 238, 239, 240, 267, 268, 269, 270, 271),
     *(295, 296, 297, 298, 319, 320, 321),
@@ -62,12 +63,14 @@ class TakeFrame:
 
 @dataclass(frozen=True)
 class Take:
-    """One take; `subjects` are masks of the subject by camera, `response` the files' encoding."""
+    """One take; `subjects` are masks of the subject by camera, `sensor` the files' encoding,
+    `exposure` that of its frames relative to other takes'."""
 
     geometry: Geometry
     frames: list[TakeFrame]
     subjects: Mapping[str, Path] = field(default_factory=dict)
-    response: Literal["linear", "srgb"] = "srgb"
+    sensor: Sensor = SRGB
+    exposure: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,10 +106,11 @@ def understood(take: Take) -> tuple[ImportSettings, Found]:
     """The take as arguments of `Import.of`: a step for each number, in capture order."""
     rank = {(f.number, f.kind, f.light): f for f in take.frames}
     keys = sorted(rank, key=lambda k: (k[0], k[1], k[2] or ""))
-    steps = [Step(i, kind, 1.0, light=light) for i, (_, kind, light) in enumerate(keys)]
+    seconds = take.exposure
+    steps = [Step(i, kind, seconds, light=light) for i, (_, kind, light) in enumerate(keys)]
     at = {key: i for i, key in enumerate(keys)}
-    frames = {(at[f.number, f.kind, f.light], f.camera): {1.0: f.path} for f in take.frames}
-    settings = ImportSettings(sensor=Sensor(response=take.response), units="relative")
+    frames = {(at[f.number, f.kind, f.light], f.camera): {seconds: f.path} for f in take.frames}
+    settings = ImportSettings(sensor=take.sensor, units="relative")
     found = Found(tuple(steps), frames, {}, {}, {}, take.subjects, (), ())
     return settings, found
 
@@ -119,6 +123,12 @@ def mean_light(path: Path) -> float:
 def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     """`CamNN/IDxxxxx/IDxxxxx.NNNNNN.*`, and from the repository `--cameras calibration/cameras/
     NNN.xml --lights relighting/lights/light_pattern_metadata.json`, with `..._per_frame.json`.
+
+    AVIF has light^(1/2.2) without sRGB's toe, after the colour matrix (the repository's
+    color-calibration/exr2avif.py, 8e12bbb); EXR has neither. exr2avif.py takes EXR as linear,
+    although extract_public.py calls REDline with `--gammaCurve 2`, sRGB: the fully lit frames of
+    the take decide. Takes ID20088 to ID20116 have half the exposure
+    (relighting/render_reference_envmap_relit.py, f106fe0).
     """
     taken = _takes(files, files.folder, "CamNN/ID20001/ID20001.000001.exr")
     lights = _given(files.lights, "--lights relighting/lights/light_pattern_metadata.json")
@@ -136,18 +146,40 @@ def _faceolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     )
     linear = {p.suffix.lower() for paths in taken.values() for p in paths.values()} <= {".exr"}
     frames, notes = _sequence(taken, geometry, order, mean, 0)
+    sensor = Sensor(response=2.2)
+    if linear:
+        colours = lights.parent.parent.parent / "color-calibration" / "colorcalib_exr.mat"
+        sensor = Sensor(response="linear", matrix=_matrix(colours))
+        if sensor.matrix is None:
+            notes.append(f"{colours}: no such file, colours are not calibrated")
+    name = re.search(r"/ID2(\d{4})/", frames[0].path.as_posix())
+    half = name is not None and 88 <= int(name[1]) <= 116
+    if half:
+        notes.append("the take has half the exposure of others (ID20088 to ID20116): corrected")
     return Take(
         replace(geometry, cameras=_shot(geometry, taken), notes=[*geometry.notes, *notes]),
         frames,
-        response="linear" if linear else "srgb",
+        sensor=sensor,
+        exposure=0.5 if half else 1.0,
     )
+
+
+def _matrix(path: Path) -> Any:
+    """The upper left 3 x 3 numbers of a text file of 4 x 4; None without the file."""
+    if not path.is_file():
+        return None
+    try:
+        return tuple(map(tuple, np.loadtxt(plain_file(path)).reshape(4, 4)[:3, :3].tolist()))
+    except ValueError as error:
+        raise PresetProblem(f"{path}: expected 4 x 4 numbers ({error})") from error
 
 
 def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     """A pose: `images_processed` or `images_raw/CamNN/ID.NNN.avif`, and `../shared` of its subject.
 
     Processed images are undistorted; frame 0 is white light, 1 to 13 are gradients and
-    environments, single lights follow from 13 or 14 on.
+    environments, single lights follow from 13 or 14 on. Both have sRGB's curve: the authors'
+    code/utils/avif_image_utils.py (99f3d04) decodes every AVIF by it.
     """
     folder, shared = files.folder, files.folder.parent / "shared"
     pictures = next(
@@ -190,7 +222,6 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
         ),
         [*white, *frames],
         {c: p for c, p in masks.items() if p.is_file()},
-        "srgb" if pictures.name == "images_processed" else "linear",
     )
 
 

@@ -36,6 +36,7 @@ from reconstruction.files.tiff_tags import dng_levels
 from reconstruction.options import options
 
 Positive = Annotated[float, Field(gt=0)]
+Row = tuple[float, float, float]
 MOSAICS = {
     "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
     "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
@@ -60,7 +61,8 @@ class Sensor:
     (gAMA, cICP, ICC), else "srgb" for 8 bits, JPEG and AVIF, else "linear". `black` and `white` in
     the file's values: no light, and a full channel; None: those of the file, else 0 and the largest
     of the type (1 for floats, which saturate only with `white` or the EXR attribute `fullScale`).
-    `bayer`: the colours of the first two rows of a sensor's mosaic. `orientation`: whether the
+    `bayer`: the colours of the first two rows of a sensor's mosaic. `matrix`: rows that take linear
+    RGB of the files to linear Rec. 709, after the files' own primaries. `orientation`: whether the
     camera's pixels are those stored, or turned by EXIF; None: by the size, if that decides.
     """
 
@@ -68,6 +70,7 @@ class Sensor:
     black: Annotated[float, Field(ge=0)] | None = None
     white: Positive | None = None
     bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+    matrix: tuple[Row, Row, Row] | None = None
     orientation: Literal["stored", "turned"] | None = None
 
 
@@ -156,7 +159,7 @@ def read_picture(
         )
     if values_only:
         black = sensor.black if suffix in RAW else 0.0
-        sensor = replace(sensor, response="linear", black=black)
+        sensor = replace(sensor, response="linear", black=black, matrix=None)
     if suffix == ".exr":
         picture = _exr(path, sensor)
     elif suffix in RAW:
@@ -166,6 +169,10 @@ def read_picture(
         if sensor.white is None and white is not None:
             sensor = replace(sensor, white=white)
         picture = _counts(path, values, sensor, Colour() if values_only else colour)
+    if sensor.matrix is not None:
+        light = np.asarray(picture.light @ np.array(sensor.matrix).T, np.float32)
+        quantum = np.broadcast_to(picture.quantum, light.shape)
+        picture = replace(picture, light=light, quantum=quantum)
     return _turned_picture(picture, turn)
 
 

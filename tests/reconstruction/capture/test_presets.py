@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import camera_writers as writers
@@ -11,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction import Camera, Capture
+from reconstruction import Camera, Capture, write_exr
 from reconstruction.capture.import_folder import Import
 from reconstruction.capture.lit_pattern import PresetProblem, find_pattern, fully_lit
 from reconstruction.capture.presets import HATCH, PresetFiles, Take, read_preset, understood
+from reconstruction.files.pictures import Sensor, read_picture
 from reconstruction.geometry.lights import dome_positions
 from stage_service.cli import main
 
@@ -171,11 +173,13 @@ def test_humanolat(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         take.geometry.cameras["Cam01"].center, np.add(place, [1, 0, 0]), atol=1e-6
     )
-    assert take.response == "srgb"
+    assert take.sensor == Sensor(response="srgb")
+    (pose / "images_processed").rename(pose / "images_raw")
+    assert read_preset("humanolat", PresetFiles(pose), mean).sensor == Sensor(response="srgb")
 
 
 def test_the_command_imports_a_take_of_avif(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """By `hairstage import`, and told what was found; pictures of 8 bits are sRGB."""
+    """By `hairstage import`; AVIF has a power of 2.2 without sRGB's toe."""
     files = faceolat(tmp_path, 0)
     for path in (files.folder / "Cam02").rglob("*.png"):
         path.unlink()
@@ -200,4 +204,39 @@ def test_the_command_imports_a_take_of_avif(tmp_path: Path, capsys: pytest.Captu
     capture = Capture(out)
     assert len(capture.of_kind("tracking")) == len(AT_0)
     share = capture.frame(capture.of_kind("tracking")[0], "Cam01")[8, 4]
-    np.testing.assert_allclose(share, ((200 / 255 + 0.055) / 1.055) ** 2.4, rtol=0.02)
+    np.testing.assert_allclose(share, (200 / 255) ** 2.2, rtol=0.02)
+
+
+def test_faceolat_exposure_and_colours(tmp_path: Path) -> None:
+    """Takes ID20088 to ID20116 are twice as bright as their files; EXR has no colour matrix yet."""
+    files = faceolat(tmp_path, 0)
+    take = read_preset("faceolat", files, mean)
+    assert take.sensor == Sensor(response=2.2)
+    for name, seconds in (("ID20087", 1.0), ("ID20116", 0.5), ("ID30090", 1.0)):
+        for folder in files.folder.glob("Cam*/ID*"):
+            folder.rename(folder.with_name(name))
+        take = read_preset("faceolat", files, mean)
+        _, found = understood(take)
+        assert {tuple(b) for b in found.frames.values()} == {(seconds,)}
+        assert any("half the exposure" in n for n in take.geometry.notes) == (seconds == 0.5)
+    for path in files.folder.rglob("*.png"):
+        path.rename(path.with_suffix(".exr"))
+    repository = tmp_path / "FaceOLAT"
+    lights = repository / "relighting" / "lights" / files.lights.name
+    lights.parent.mkdir(parents=True)
+    for path in tmp_path.glob("light_pattern*.json"):
+        path.rename(lights.parent / path.name)
+    levels = dict(enumerate(brightness(350, 0)))
+
+    def of_name(path: Path) -> float:
+        return float(levels[int(path.stem[-6:])])
+
+    files = replace(files, lights=lights)
+    assert read_preset("faceolat", files, of_name).sensor == Sensor(response="linear")
+    colours = repository / "color-calibration" / "colorcalib_exr.mat"
+    colours.parent.mkdir()
+    colours.write_text("1.5 0 0.25 0\n0 1 0 0\n0 0 2 0\n0 0 0 1\n")
+    sensor = read_preset("faceolat", files, of_name).sensor
+    write_exr(tmp_path / "red.exr", np.full((2, 2, 3), [0.4, 0.2, 0.1], np.float32))
+    light = read_picture(tmp_path / "red.exr", sensor, (2, 2)).light
+    np.testing.assert_allclose(light[0, 0], [0.625, 0.2, 0.2], rtol=1e-3)
