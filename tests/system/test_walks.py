@@ -1,4 +1,4 @@
-"""Six walks: from a folder of files to strands in another program, typed as the pages print them.
+"""Walks from a folder of files to strands in another program, typed as the pages print them.
 
 What a user adds to a command is named by the page or by the command's own error.
 """
@@ -243,16 +243,71 @@ def faceolat(folder: Path, shoot: Shoot) -> None:
             write_exr(take / f"ID20001.{i + 1:06d}.exr", (FULL * image).astype(np.float32))
 
 
+def srgb(image: np.ndarray) -> np.ndarray:
+    """8 bits."""
+    curve = np.where(image > 0.0031308, 1.055 * image ** (1 / 2.4) - 0.055, 12.92 * image)
+    return np.round(255 * curve[..., ::-1]).astype(np.uint8)
+
+
+def humanolat(folder: Path, shoot: Shoot) -> None:
+    """A pose of AVIF; white light, 13 gradients, then the single lights; cameras in mm."""
+    shared, lit = folder.parent / "shared", (0, 20, 41, 62, 68)
+    shared.mkdir()
+    metres = [replace(c, t=shoot.unit * c.t) for c in shoot.of_files]
+    writers.write_calib(shared / "cameras.calib", metres)
+    rows = (shoot.unit * shoot.to_files(shoot.lights)).tolist()
+    vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in rows)
+    (shared / "LSX_light_positions_aligned.pc").write_text(vertices)
+    spiral = "".join(f"{i + 1}\n" for i in range(shoot.count))
+    (shared / "LSX3_light_z_spiral.txt").write_text(spiral)
+    masks = folder / "segmentations" / "masks" / "000"
+    masks.mkdir(parents=True)
+    for camera in shoot.cameras:
+        taken = folder / "images_processed" / camera.name
+        taken.mkdir(parents=True)
+        cv2.imwrite(str(masks / f"{camera.name}.png"), 255 * met(camera)[1].astype(np.uint8))
+        singles = iter(shoot.lights)
+        for i in range(14 + shoot.count + len(lit)):
+            whole = i < 14 or i - 14 in lit
+            image = shoot.picture(camera, None if whole else next(singles)[None])
+            best = [cv2.IMWRITE_AVIF_QUALITY, 100]
+            assert cv2.imwrite(str(taken / f"C003.{i:06d}.avif"), srgb(image), best)
+
+
+def openillumination(folder: Path, shoot: Shoot) -> None:
+    frames = {}
+    for camera in shoot.of_files:
+        right, down, forward = camera.R
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([right, -down, -forward, camera.center], axis=1)
+        angle = 2 * np.arctan(camera.width / 2 / camera.K[0, 0])
+        frames[camera.name] = {"camera_angle_x": angle, "transform_matrix": matrix.tolist()}
+    (folder / "output" / "obj_masks").mkdir(parents=True)
+    (folder / "output" / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    np.save(folder.parent / "light_pos.npy", shoot.to_files(shoot.lights))
+    for camera in shoot.cameras:
+        mask = 255 * met(camera)[1].astype(np.uint8)
+        cv2.imwrite(str(folder / "output" / "obj_masks" / f"{camera.name}.png"), mask)
+
+    def put(camera: Camera, i: int, image: np.ndarray) -> None:
+        path = folder / "Lights" / f"{i:03d}" / "raw_undistorted" / f"{camera.name}.JPG"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), srgb(image))
+
+    shoot.write(put)
+
+
 @dataclass(frozen=True)
 class Walk:
-    """A folder; `shown` of the pages' command to import; `named` by its errors; `measured` by the
-    user, as the page says."""
+    """A folder; `shown` of the pages' command to import; options `named` by its errors; `measured`
+    (or the set) is known to the user, as the page says; `fitted` by the tutorial's step 5."""
 
     write: Callable[[Path, Shoot], None]
     pixels: Callable[[Path], readers.Pixels]
     shoot: Callable[[], Shoot]
     named: tuple[str, ...] = ()
     measured: str = ""
+    fitted: bool = False
     shown: str = "hairstage import FOLDER --out capture"
 
 
@@ -274,12 +329,23 @@ WALKS = {
     "easymocap": Walk(easymocap, readers.of_easymocap, lambda: Shoot(NUMBERED)),
     "nerfstudio": Walk(
         nerfstudio, lambda f: readers.of_nerfstudio(f / "transforms.json"),
-        lambda: Shoot(CAMS, unit=0.37), measured="--unit 0.37",
+        lambda: Shoot(CAMS, unit=0.37), measured="--unit 0.37", fitted=True,
     ),
     "faceolat": Walk(
         faceolat, lambda f: readers.of_metashape(f.parent / "calibration/cameras/001.xml"),
         lambda: Shoot([f"Cam{n}" for n in NUMBERED], axes=Y_UP),
         shown="hairstage import FOLDER --preset faceolat",
+    ),
+    "humanolat": Walk(
+        humanolat, lambda f: readers.of_calib(f.parent / "shared/cameras.calib", 56),
+        lambda: Shoot([f"Cam{n}" for n in NUMBERED], axes=Y_UP, unit=1e-3),
+        measured="--preset humanolat",
+    ),
+    "openillumination": Walk(
+        openillumination,
+        lambda f: readers.of_openillumination([f / "output/transforms_train.json"], 56, 56),
+        lambda: Shoot(["A1", "A2", "B3", "B4", "C5", "C6", "CE2", "CF8"], axes=Y_UP), ("--up y",),
+        measured="--preset openillumination",
     ),
 }  # fmt: skip
 FAST = ("exr", "colmap")
@@ -369,7 +435,11 @@ def test_walk(
     typed.done(" ".join([line, *named]))
     assert "seconds" in typed.done(printed("hairstage reconstruct capture --estimate"))
     typed.done(printed("hairstage reconstruct capture --out model"))
-    assert "open_in_blender.py" in typed.done(printed("hairstage export model --to blender"))
+    if walk.fitted:
+        typed.done(printed("hairstage fit capture model"))
+    said = typed.done(printed("hairstage export model --to blender"))
+    assert "open_in_blender.py" in said
+    assert ("has no fit" in said) != walk.fitted
     typed.done(printed("hairstage export model --to usd"))
 
     # what Blender's script reads: metres, z up, where the ball is
