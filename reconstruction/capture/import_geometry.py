@@ -59,7 +59,7 @@ CAMERA_FILES = (
     *("sparse/0", "sparse", "transforms.json", "cameras.xml"),
     *("intri.yml", "calib/intri.yml"),
 )
-LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy")
+LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy", "lights.mat")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".r3d")
 CONSTANT = (
     "images under one light at a time are needed: sets under constant light (NeRSemble, "

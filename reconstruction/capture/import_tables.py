@@ -11,6 +11,7 @@ from reconstruction.arrays import Array
 from reconstruction.capture.import_geometry import Geometry, checked
 from reconstruction.capture.import_settings import ImportProblem
 from reconstruction.containment import is_file_name
+from reconstruction.files.lights import lobe
 from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -141,7 +142,11 @@ def lights_of(path: Path, cameras: dict[str | int, str], length: Unit = "m") -> 
                 f"{where}.colocated_camera: no camera has the id {beside!r}; "
                 f"there are {list(cameras)}"
             )
-        out.append(Light(name, position, intensity, None if beside is None else cameras[beside]))
+        camera = None if beside is None else cameras[beside]
+        try:
+            out.append(Light(name, position, intensity, camera, **lobe(entry, where)))
+        except ValueError as error:
+            raise ImportProblem(str(error)) from error
     return out
 
 

@@ -26,7 +26,7 @@ Size = tuple[int, int]
 """Width and height."""
 
 RAW = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"}
-FORMATS = {".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".avif"} | RAW
+FORMATS = {".exr", ".hdr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".avif", ".pgm", ".ppm"} | RAW
 _AVIF_HEAD = 1 << 16  # bytes with an AVIF's boxes
 
 

@@ -1,11 +1,14 @@
-"""Files of light positions: `.json`, `.csv`, `.txt`, `.npy`, `.obj`, `.pc`.
+"""Files of light positions: `.json`, `.csv`, `.txt`, `.npy`, `.mat`, `.obj`, `.pc`.
 
 `.json`: a list of positions, an object of positions by name, or a list under `lights`,
 `light_positions` or `positions`; a light may be an object with `position` (or x, y and z) and
-optionally `name` (or `id`), `intensity`, `colocated_camera`. `.csv` and `.txt`: the same columns by
-the names in a header line, else an optional name, x, y, z, optional intensity; with semicolons as
-separators, commas are decimal. A unit is stated as in `x_mm`, `x [cm]`, `"position_mm"` or
-`"units": {"position": "mm"}`. `.npy`: (N, 3). `.obj`, `.pc`: lines `v x y z`.
+optionally `name` (or `id`), `intensity`, `colocated_camera`, `aim` (or `direction`, `axis`) and
+`mu`: its intensity falls as cos^mu of the angle to its aim, 1 (Lambertian) by default, and does not
+depend on direction without an aim. `.csv` and `.txt`: the same columns by the names in a header
+line (`aim_x`), else an optional name, x, y, z, optional intensity; with semicolons as separators,
+commas are decimal. A unit is stated as in `x_mm`, `x [cm]`, `"position_mm"` or
+`"units": {"position": "mm"}`. `.npy`: (N, 3). `.mat`: `S (N, 3)`, optionally `Dir (N, 3)`,
+`mu (N,)`, `Phi (N, 3)`, as of Quéau et al. (JMIV 60(3), 2018). `.obj`, `.pc`: lines `v x y z`.
 """
 
 from __future__ import annotations
@@ -18,10 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import loadmat, whosmat
 
 from reconstruction.arrays import Array
 from reconstruction.containment import is_file_name
 from reconstruction.files.numpy_files import read_array
+from reconstruction.geometry.cameras import facing
+from reconstruction.geometry.light_profiles import cosine_lobe
 from reconstruction.geometry.lights import Light
 from reconstruction.reading import read_json, read_text
 
@@ -29,9 +35,11 @@ METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "mm": 0.001, "in": 0
 METRES |= {"inch": 0.0254, "inche": 0.0254, "foot": 0.3048, "feet": 0.3048, "centimetre": 0.01}
 METRES |= {"centimeter": 0.01, "millimetre": 0.001, "millimeter": 0.001}
 """By name without a plural's s."""
+MOST_NUMBERS = 100_000
 _UNIT = rf"(?:[ _.]*[ _.\[(/](?P<unit>(?:{'|'.join(METRES)})s?)[\])]?)?"
 _PLACE = re.compile(rf"(?:p|(?:position|pos)?[ _.]*)(?P<axis>[xyz]|position){_UNIT}")
 _NAME = re.compile("(?:light|lamp|led)?[ _]*(?:name|id|label|number|index|no)|light|lamp|led|#")
+_AIM = re.compile(r"(?:aim|axis|dir|direction)[ _.]*([xyz])?|d([xyz])")
 _COLOUR = re.compile(r"(?:intensity[ _.]*)?(r|g|b|red|green|blue)")
 
 
@@ -60,7 +68,7 @@ def read_lights(path: str | Path) -> LightFile:
     """
     path = Path(path)
     readers = {".json": _json, ".csv": _table, ".txt": _table, ".npy": _npy}
-    readers |= {".obj": _vertices, ".pc": _vertices}
+    readers |= {".obj": _vertices, ".pc": _vertices, ".mat": _mat}
     if path.suffix.lower() not in readers:
         raise LightFileError(f"{path}: expected a file of lights ({', '.join(readers)})")
     try:
@@ -129,9 +137,22 @@ def _light(entry: dict[str, Any], i: int, where: str) -> Light:
             f"{where} ({name}): colocated_camera: expected a camera's name, got {beside!r}"
         )
     try:
-        return Light(name, position, intensity, beside)
+        return Light(name, position, intensity, beside, **lobe(entry, f"{where} ({name})"))
     except ValueError as error:
         raise LightFileError(f"{where}: {error}") from error
+
+
+def lobe(entry: dict[str, Any], where: str) -> dict[str, Any]:
+    """`orientation` and `profile` of a light with an `aim`. Raises `ValueError`."""
+    if "aim" not in entry:
+        if "mu" in entry:
+            raise LightFileError(f"{where}: mu needs an aim, the direction that it points to")
+        return {}
+    aim = _three(entry["aim"], f"{where}: aim")
+    if not aim.any():
+        raise LightFileError(f"{where}: aim: expected a direction, got 0")
+    power = _three(entry.get("mu", 1.0), f"{where}: mu", spread=True)[0]
+    return {"orientation": facing(aim), "profile": cosine_lobe(float(power))}
 
 
 def _three(value: Any, where: str, spread: bool = False) -> Array:
@@ -185,14 +206,22 @@ def _entry(value: Any, path: Path, unit: float | None) -> dict[str, Any]:
     unit = _unit(value, path) or unit
     places = {k: m for k in value if (m := _PLACE.fullmatch(k.strip().lower()))}
     axes = {m["axis"]: k for k, m in places.items()}
-    out = {k: v for k, v in value.items() if k in ("name", "id", "intensity", "colocated_camera")}
+    fields = ("name", "id", "intensity", "colocated_camera", "mu")
+    out = {k: v for k, v in value.items() if k in fields}
+    aims = {m[1] or m[2]: k for k in value if (m := _AIM.fullmatch(k.strip().lower()))}
+    if set(aims) == set("xyz"):
+        out["aim"] = [value[aims[a]] for a in "xyz"]
+    elif set(aims) == {None}:
+        out["aim"] = value[aims[None]]
     if len(axes) != len(places) or ("position" in axes and len(axes) > 1):
         raise LightFileError(f"{path}: {', '.join(places)} give a position twice")
     if set(axes) == set("xyz"):
         out["position"] = [value[axes[a]] for a in "xyz"]
     elif "position" in axes:
         out["position"] = value[axes["position"]]
-    out["unused"] = [k for k in value if k not in (*out, *axes.values(), "unit", "units")]
+    out["unused"] = [
+        k for k in value if k not in (*out, *axes.values(), *aims.values(), "unit", "units")
+    ]
     stated = {m["unit"] for m in places.values()}
     if len(stated) > 1:
         raise LightFileError(f"{path}: {', '.join(places)}: expected one unit for x, y and z")
@@ -209,6 +238,27 @@ def _npy(path: Path) -> list[dict[str, Any]]:
     if positions.ndim != 2 or positions.shape[1] != 3 or positions.dtype.kind not in "fiu":
         raise LightFileError(f"{path}: expected (N, 3) numbers, got {positions.shape}")
     return [{"position": p} for p in positions]
+
+
+def _mat(path: Path) -> list[dict[str, Any]]:
+    fields = {"S": "position", "Dir": "aim", "mu": "mu", "Phi": "intensity"}
+    try:
+        shapes = {name: shape for name, shape, _ in whosmat(str(path)) if name in fields}
+        if any(np.prod(shape) > MOST_NUMBERS for shape in shapes.values()):
+            raise LightFileError(f"{path}: too large for a file of lights: {shapes}")
+        found = {f: np.atleast_2d(loadmat(str(path), variable_names=[f])[f]) for f in shapes}
+    except OSError:
+        raise
+    except Exception as error:  # SciPy raises various types for damaged files
+        raise LightFileError(f"{path}: not a MATLAB file of lights ({error})") from error
+    count = len(found.get("S", ()))
+    found = {k: v.reshape(-1, 1) if v.size == count else v for k, v in found.items()}
+    wrong = [k for k, v in found.items() if len(v) != count or v.dtype.kind not in "fiu"]
+    if not count or wrong:
+        raise LightFileError(
+            f"{path}: expected S (N, 3), optionally Dir (N, 3), mu (N,), Phi (N, 3), got {shapes}"
+        )
+    return [{fields[k]: v[i] for k, v in found.items()} for i in range(count)]
 
 
 def _vertices(path: Path) -> list[dict[str, Any]]:
@@ -256,7 +306,7 @@ def _named_row(columns: list[str], words: list[str], path: Path, line: int) -> d
         colour = _COLOUR.fullmatch(column)
         if _NAME.fullmatch(column) and word and "name" not in row:
             row["name"] = word
-        elif _PLACE.fullmatch(column):
+        elif _PLACE.fullmatch(column) or (word and (_AIM.fullmatch(column) or column == "mu")):
             row[column] = _float(word, path, line)
         elif colour or (column == "intensity" and word):
             row[f"intensity {colour[1][0]}" if colour else column] = _float(word, path, line)

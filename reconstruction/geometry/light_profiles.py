@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -109,6 +110,19 @@ class LightProfile:
     def to_dict(self) -> dict[str, Any]:
         """A JSON-ready description: `LightProfile(**it)` is the same again."""
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+
+
+@lru_cache
+def cosine_lobe(power: float) -> LightProfile:
+    """cos^power of the angle to the aim, 0 behind: an LED; 1 is a Lambertian emitter.
+
+    Linear between steps of 0.5 degrees. Raises `ValueError` for a power outside [0, 1000].
+    """
+    if not 0 <= power <= 1000:
+        raise ValueError(f"the power of a cosine lobe must lie in [0, 1000], got {power}")
+    angle = np.linspace(0, 90, 181)
+    values = np.cos(np.radians(angle)).clip(0) ** power
+    return LightProfile(f"cosine_{power:g}", np.array([0, 360]), angle, np.stack([values, values]))
 
 
 _SLACK_DEG = 1e-9  # keeps a direction on the last node inside despite rounding

@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
     imported.add_argument(
         "--lights",
         type=Path,
-        help="instead of lights.json: positions or directions in .json, .csv, .npy, .obj",
+        help="instead of lights.json: positions or directions in .json, .csv, .npy, .mat, .obj",
     )
     imported.add_argument(
         "--light-distance", type=float, help="metres; for lights given as directions"

@@ -96,6 +96,7 @@ def everywhere(write: Callable[[str, int, Floats], Any]) -> None:
         ("{}/{:03d}.png", np.uint16, 1e-5),
         ("{}/{:03d}.tif", np.uint16, 1e-5),
         ("{}/{:03d}.png", np.uint8, 5e-3),
+        ("{}/{:03d}.ppm", np.uint16, 1e-5),
         ("{}/{:03d}.jpg", np.uint8, 4e-2),
     ],
 )

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
+from reconstruction import Camera, Rig
 from reconstruction.files.lights import LightFileError, read_lights
 
 
@@ -110,3 +114,79 @@ def test_columns_that_are_not_used_are_named(tmp_path: Path) -> None:
     found = read_lights(tmp_path / "a.csv")
     assert found.lights[0].intensity.tolist() == [1, 2, 3]
     assert "not used of its lights: power" in found.notes[0]
+
+
+S = np.array([[-219.4, -57.9, 517.0], [213.1, -181.9, 444.7]])
+AIMS = np.array([[0.96, -0.1, 0.24], [-0.66, 0.58, 0.47]])
+PHI = np.array([[4.1e7, 7.4e7, 4.7e7], [3.1e7, 5.4e7, 3.3e7]])
+
+
+def write_csv(path: Path) -> None:
+    rows = [
+        ",".join(map(str, [i, *place, *aim, 1.5, *phi]))
+        for i, (place, aim, phi) in enumerate(zip(S, AIMS, PHI, strict=True))
+    ]
+    path.write_text("\n".join(["id,x,y,z,aim_x,aim_y,aim_z,mu,r,g,b", *rows]) + "\n")
+
+
+def write_json(path: Path) -> None:
+    entries = [
+        {"position": p, "direction": a, "mu": 1.5, "intensity": phi}
+        for p, a, phi in zip(S.tolist(), AIMS.tolist(), PHI.tolist(), strict=True)
+    ]
+    path.write_text(json.dumps({"lights": entries}))
+
+
+def write_mat(path: Path) -> None:
+    savemat(path, {"S": S, "Dir": AIMS, "mu": np.full((2, 1), 1.5), "Phi": PHI})
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("lights.csv", write_csv), ("lights.json", write_json), ("lights.mat", write_mat)],
+)
+def test_lights_with_an_axis_shine_as_a_power_of_the_cosine(
+    name: str, write: Callable[[Path], None], tmp_path: Path
+) -> None:
+    write(tmp_path / name)
+    found = read_lights(tmp_path / name)
+    assert found.notes == []
+    for light, place, aim, phi in zip(found.lights, S, AIMS, PHI, strict=True):
+        np.testing.assert_allclose(light.position, place)
+        towards = np.array([0.3, 0.4, 0.5])
+        cosine = max(0.0, towards @ aim / np.linalg.norm(aim) / np.linalg.norm(towards))
+        shines = light.intensity_towards(place + 40 * towards)
+        np.testing.assert_allclose(shines, phi * cosine**1.5, rtol=1e-4)
+    assert found.lights[0].profile is found.lights[1].profile
+    rig = Rig("near", (Camera.look_at("cam", 8, 8, [1, 0, 0], [0, 0, 0], 20),), (*found.lights,))
+    again = Rig.from_dict(json.loads(json.dumps(rig.to_dict())))
+    np.testing.assert_array_equal(
+        again.lights[1].intensity_towards(S[0]), rig.lights[1].intensity_towards(S[0])
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[{"position": [0, 0, 1], "mu": 1}]', "mu needs an aim"),
+        ('[{"position": [0, 0, 1], "aim": [0, 0, 0]}]', "expected a direction"),
+        ('[{"position": [0, 0, 1], "aim": [0, 1, 0], "mu": -1}]', "power of a cosine lobe"),
+    ],
+)
+def test_wrong_axes_are_named(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "lights.json").write_text(text)
+    with pytest.raises(LightFileError, match=said):
+        read_lights(tmp_path / "lights.json")
+
+
+def test_other_matlab_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lights.mat"
+    savemat(path, {"K": np.eye(3)})
+    with pytest.raises(LightFileError, match=r"expected S \(N, 3\)"):
+        read_lights(path)
+    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(40))
+    with pytest.raises(LightFileError, match="not a MATLAB file of lights"):
+        read_lights(path)
+    savemat(path, {"S": S, "Dir": AIMS[:1]})
+    with pytest.raises(LightFileError, match="expected S"):
+        read_lights(path)
