@@ -27,6 +27,7 @@ from reconstruction.capture.records import Step, StepKind
 from reconstruction.containment import plain_file
 from reconstruction.files.cameras import CameraFile, read_cameras
 from reconstruction.files.cameras.nerfstudio import read_transforms
+from reconstruction.files.encoded import FORMATS
 from reconstruction.files.lights import LightFile, read_lights
 from reconstruction.files.pictures import Sensor, picture_size, read_picture
 from reconstruction.geometry.cameras import Camera
@@ -232,12 +233,12 @@ def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) 
     folder = files.folder
     tables = sorted((folder / "output").glob("transforms_*.json"))
     lit = {int(p.name): p for p in sorted((folder / "Lights").glob("*")) if p.name.isdigit()}
-    shot = {n: {f.stem: f for f in (p / "raw_undistorted").glob("*")} for n, p in lit.items()}
+    shot = {n: _pictures(p / "raw_undistorted") for n, p in lit.items()}
     if not tables or not any(shot.values()):
         raise PresetProblem(
             f"{folder}: expected output/transforms_train.json and Lights/000/raw_undistorted/A1.JPG"
         )
-    if set(lit) == PATTERNS or folder.parent.name == "lighting_patterns":
+    if set(lit) <= PATTERNS or folder.parent.name == "lighting_patterns":
         raise PresetProblem(
             f"{folder}: each image is lit by a pattern of many lamps, single lights are needed: "
             "download the object with --light OLAT (20 of the 64 objects have it)"
@@ -256,14 +257,19 @@ def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) 
             raise PresetProblem(f"{table}: frames: expected an object by the cameras' names")
         there = {c: picture_size(pictures[c]) for c in frames if c in pictures}
         sized = {c: {**frames[c], "w": w, "h": h} for c, (w, h) in there.items()}
-        if sized:
-            read = read_transforms(table, {"frames": sized})
-            cameras |= {c.name: c for c in read.cameras}
+        read = read_transforms(table, {"frames": sized}).cameras if sized else []
+        cameras |= {c.name: c for c in read}
+    if not cameras:
+        raise PresetProblem(f"{tables[0]}: none of the cameras {', '.join(pictures)} has a pose")
     where = replace(PlacementOptions(), **given)
     geometry = _placed(CameraFile(list(cameras.values()), axes="opengl"), lights, where)
     if where.unit == "m":
         geometry.notes.append(f"{tables[0]} has no unit: m is assumed (--unit)")
+    if without := sorted(set(pictures) - set(geometry.cameras)):
+        geometry.notes.append(f"{', '.join(without)}: no pose, skipped")
     names = [light.name for light in geometry.lights]
+    if dark := [name for n, name in enumerate(names) if not shot.get(n)]:
+        geometry.notes.append(f"{len(dark)} lights have no image and are skipped: {dark[0]}, …")
     single = [
         TakeFrame("olat", n, camera, path, names[n])
         for n, taken in shot.items()
@@ -272,6 +278,10 @@ def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) 
     ]
     masks = {c: folder / "output" / "obj_masks" / f"{c}.png" for c in cameras}
     return Take(geometry, single, {c: p for c, p in masks.items() if p.is_file()})
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    return {f.stem: f for f in sorted(folder.glob("*")) if f.suffix.lower() in FORMATS}
 
 
 def _above(folder: Path, name: str) -> Path | None:

@@ -266,6 +266,26 @@ def test_a_set_without_single_lights_is_refused_with_the_way_on(
     assert not (tmp_path / "capture").exists()
 
 
+def test_what_openillumination_lacks_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Part of a download: two lights, a camera that is in no table."""
+    folder = tmp_path / "OLAT" / "obj_20_greenhead"
+    write_openillumination(folder, ["A1", "B3", "CE2"], [0, 40])
+    np.save(tmp_path / "light_pos.npy", LIGHTS)
+    put(folder / "Lights" / "040" / "raw_undistorted" / "D5.JPG", cells(40, 3))
+    words = ["import", str(folder), "--preset", "openillumination", "--up", "y"]
+    assert main([*words, "--out", str(tmp_path / "capture")]) == 0
+    said = capsys.readouterr().err
+    assert "D5: no pose, skipped" in said
+    assert "62 lights have no image and are skipped: light_001" in said
+    assert len(Capture(tmp_path / "capture").rig.lights) == 2
+    for table in (folder / "output").glob("*.json"):
+        table.write_text(json.dumps({"frames": {}}))
+    assert main([*words, "--out", str(tmp_path / "other")]) == 3
+    assert "none of the cameras A1, B3, CE2, D5 has a pose" in capsys.readouterr().err
+
+
 def test_a_folder_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
