@@ -8,11 +8,11 @@ from .metrics.scores import psnr as psnr
 from .metrics.scores import scores as scores
 from .metrics.scores import ssim as ssim
 from .model.assess import assess as assess
+from .model.fit_cost import estimate_fit as estimate_fit
+from .model.fitted_field import fit_field_validated as fit_field_validated
 from .model.fitted_model import FittedModel as FittedModel
 from .model.relight import relight as relight
 from .model.relit_pictures import relight_model as relight_model
-from .model.validated import fit_field_validated as fit_field_validated
-from .model.validated import fit_validated as fit_validated
 from .observations import HeldOut as HeldOut
 from .render.environment import render_environment as render_environment
 from .render.mixed import Environment as Environment

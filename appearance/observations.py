@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction import Camera, Capture, CaptureError, Light, Model, ModelError
-from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.arrays import Array, Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -105,3 +105,18 @@ def observe_hair(
     if not seen:
         raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
     return seen
+
+
+def far_apart(positions: Array, most: int) -> list[int]:
+    """Indices of `most` of `positions (N, 3)`, or of all: the first, then the furthest from those.
+
+    The distance is the angle about the origin.
+    """
+    towards = positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    chosen = [0]
+    nearest = towards @ towards[0]
+    while len(chosen) < min(most, len(positions)):
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, towards @ towards[chosen[-1]])
+    return chosen

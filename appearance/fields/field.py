@@ -120,7 +120,9 @@ class Field:
             places = Places(uv, kept, data["fitted"].astype(np.int64))
         except (KeyError, TypeError, ValueError) as error:
             path = model.file(FIELD_FILE)
-            raise ModelError(f"{path}: {error}: run 'hairstage fit --field' again") from error
+            raise ModelError(
+                f"{path}: {error}: run 'hairstage fit --stages field' again"
+            ) from error
         return cls(kind, degree, grid, places, rows, values)
 
 

@@ -17,19 +17,19 @@ from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures, irradiance
 from appearance.fields.solver import ignore
-from appearance.fields.validation import GROUPS, Data, Folds, Verdict, cross_validated
+from appearance.fields.validation import Data, Folds, cross_validated
+from appearance.metrics.decision import Decision
 from appearance.render.harmonics import harmonics
 from reconstruction import Progress, silent
 from reconstruction.arrays import Bools, Floats
 from reconstruction.report.progress import part_of
 
+NOTHING = "no frame can be held out of one view and fewer than four lights"
 MOST_CLAMPED = 0.01
 """Share of samples with a negative modulation above which they are excluded from the fit."""
 _CLAMP_ROUNDS = 2
 JUDGED = 1000
 """Most validation pixels of a view."""
-MARGIN = 2.0
-"""Least gain of a field in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -42,43 +42,18 @@ class Monitor:
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A field and its validation.
+    """A field, and whether it is kept by images that fields to other images were judged on.
 
-    `validation` has, by group of `GROUPS`, the PSNR in dB of left-out images "without" and "with"
-    fields that were fitted to others, and the "spread" (standard error) of the gain. `gain` is the
-    mean gain and its spread; `tried` are the ridges with their gain and spread. `clamped` is the
-    share of samples with a negative modulation; `warnings` are for the user.
+    `tried` are the ridges with the error of left-out images. `clamped` is the share of samples with
+    a negative modulation; `warnings` are for the user.
     """
 
     field: Field
     ridge: float
-    validation: dict[str, dict[str, float]]
-    gain: tuple[float, float]
-    tried: list[tuple[float, float, float]]
+    decision: Decision
+    tried: list[tuple[float, float]]
     clamped: float
     warnings: list[str] = dataclasses.field(default_factory=list)
-
-    def doubts(self) -> list[str]:
-        """Reasons to reject the field; empty if every group gains, "both new" more than its spread,
-        and the mean more than `MARGIN` spreads."""
-        if not self.validation:
-            return ["nothing could be left out, so it has no validation"]
-        out = [
-            f"{group}: images are better without it, {score['without']:.2f} dB against "
-            f"{score['with']:.2f} dB (standard error of the gain {score['spread']:.2f} dB)"
-            for group, score in self.validation.items()
-            if not score["with"] > score["without"]
-        ]
-        both = self.validation.get(GROUPS[-1])
-        if not out and both and not both["with"] - both["without"] > both["spread"]:
-            out = [
-                f"{GROUPS[-1]}: the gain is not significant, "
-                f"{both['with'] - both['without']:.2f} ± {both['spread']:.2f} dB"
-            ]
-        gain, spread = self.gain
-        if not out and not gain > MARGIN * spread:
-            out = [f"the gain is not significant, {gain:.2f} ± {spread:.2f} dB"]
-        return out
 
 
 def fit_pictures(
@@ -91,10 +66,11 @@ def fit_pictures(
     """Fit a field to `views`, whose radiance times `scale` has white at 1.
 
     The ridge is chosen by `cross_validated`, the result fitted to all views and lights. With a
-    checkpoint a killed fit resumes after the ridges done. Raises `ValueError` without views.
+    checkpoint a killed fit resumes after the ridges done. Raises `ValueError` if neither a view nor
+    lights can be left out.
     """
-    if not views:
-        raise ValueError("a field needs a view to be fitted to")
+    if not views or not Folds.of(len(views), len(views[0].lights), 2).count:
+        raise ValueError(NOTHING)
     return _Fit(views, places, scale, options or FieldOptions(), monitor or Monitor()).run()
 
 
@@ -136,29 +112,21 @@ class _Fit:
     def run(self) -> FieldFit:
         progress, options = self.monitor.progress, self.options
         ridges = sorted(options.ridges, reverse=True)
-        if self.folds.count:
-            validating = part_of(progress, 0.3, 0.9)
-            found = cross_validated(self.data, self.folds, self.monitor.checkpoint, validating)
-            if found.best == len(ridges) - 1:
-                self.warnings.append(
-                    f"The weakest ridge, {found.ridge:g}, was chosen: the field may overfit."
-                )
-            if found.best == 0:
-                self.warnings.append(
-                    f"The strongest ridge, {found.ridge:g}, was chosen: the field changes little."
-                )
-        else:
-            found = Verdict(ridges[0], 0, [], {}, (0.0, np.inf), None)
+        validating = part_of(progress, 0.3, 0.9)
+        found = cross_validated(self.data, self.folds, self.monitor.checkpoint, validating)
+        if found.best == len(ridges) - 1:
             self.warnings.append(
-                "The field has no validation and the strongest ridge: one view and fewer than 4 "
-                "lights are too few to leave some out."
+                f"The weakest ridge, {found.ridge:g}, was chosen: the field may overfit."
+            )
+        if found.best == 0:
+            self.warnings.append(
+                f"The strongest ridge, {found.ridge:g}, was chosen: the field changes little."
             )
         progress("fitting to all images", 0.9)
         fine, clamped = self._final(found.ridge, found.start)
         values = np.asarray(self.data.unit * fine, np.float32)
         made = Field.of(self.form, self.grid, self.places, values)
-        scores = found.validation, found.gain, found.tried
-        return FieldFit(made, found.ridge, *scores, clamped, self.warnings)
+        return FieldFit(made, found.ridge, found.decision, found.tried, clamped, self.warnings)
 
     def _final(self, ridge: float, start: Floats | None) -> tuple[Floats, float]:
         """The field of all images `(M, Q · 3)`, and the share of clamped samples."""

@@ -16,13 +16,15 @@ from appearance.fields.grams import Gram
 from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
 from appearance.fields.solver import Iteration, LeastSquares, ViewSystem, conjugate_gradients
+from appearance.metrics.decision import Decision, decide
 from appearance.metrics.scores import srgb
 from appearance.render.pixel_field import PixelField
 from reconstruction import Progress
 from reconstruction.arrays import Array, Floats
 from reconstruction.files.durable import writing
 
-GROUPS = ("new lights", "new views", "both new")
+PARTS = 9
+"""Parts of a view's hair, of which errors are known separately."""
 _LEAST_LIGHTS = 4
 """Fewest lights to leave some out."""
 BLOCK = 64_000_000
@@ -74,11 +76,18 @@ class Folds:
         """The numbers of a part of the lights."""
         return [i for i, k in enumerate(self.lights) if k == part]
 
-    def group(self, fold: int, view: int, part: int) -> int | None:
-        """Number in `GROUPS` of a part of the lights in a `view`; None if it was fitted."""
+    def is_fitted(self, fold: int, view: int, part: int) -> bool:
+        """Whether a fold fits a part of the lights in a `view`."""
         left_out = self.parts(fold)
-        new_view, new_light = self.views[view] == left_out[0], part == left_out[1]
-        return (0 if new_light else None) if not new_view else (2 if new_light else 1)
+        return self.views[view] != left_out[0] and part != left_out[1]
+
+    def is_judged(self, fold: int, view: int, part: int) -> bool:
+        """Whether neither the view nor the part of the lights is fitted, where both can be left
+        out; each frame is judged in one fold."""
+        return all(
+            left_out in (-1, there)
+            for left_out, there in zip(self.parts(fold), (self.views[view], part), strict=True)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +113,7 @@ class Data:
                 tuple(
                     k
                     for k, fold in enumerate(which)
-                    if folds is None or folds.group(fold, i, part) is None
+                    if folds is None or folds.is_fitted(fold, i, part)
                 )
                 for part in parts
             ]
@@ -147,18 +156,16 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The chosen `ridge`, and the scores of left-out images.
+    """The chosen `ridge`.
 
-    `tried` are ridges with the mean gain in dB over groups and its standard error. `validation` and
-    `gain`: see `FieldFit`. `start` are coefficients near the best; `best` is the ridge's number,
-    from the strongest.
+    `decision` is that of the field. `tried` are the ridges with the error of left-out images.
+    `start` are coefficients near the best; `best` is the ridge's number, from the strongest.
     """
 
     ridge: float
     best: int
-    tried: list[tuple[float, float, float]]
-    validation: dict[str, dict[str, float]]
-    gain: tuple[float, float]
+    tried: list[tuple[float, float]]
+    decision: Decision
     start: Floats | None
 
 
@@ -178,8 +185,8 @@ def cross_validated(
     for k, ridge in enumerate(ridges):
         if k < len(state.squares):
             continue
-        found_gains = [_mean_gain(x, without)[0] for x in state.squares]
-        if found_gains and k - 1 - int(np.argmax(found_gains)) >= _PATIENCE:
+        errors = [float(x.sum()) for x in state.squares]
+        if errors and k - 1 - int(np.argmin(errors)) >= _PATIENCE:
             break
         share = 1 / len(ridges)
         systems = [replace(system, ridge=ridge) for system in systems]
@@ -192,18 +199,18 @@ def cross_validated(
                 data.solved(system, start, _iterations(f"ridge {ridge:g}, {some}", at, progress))
             )
         squares, _ = _squares(data, folds, found)
-        progress(
-            f"ridge {ridge:g}: left-out images gain {_mean_gain(squares, without)[0]:.2f} dB",
-            (k + 1) * share,
-        )
+        error = _decision(squares, without, counts).before
+        progress(f"ridge {ridge:g}: error on left-out images {error:.4f}", (k + 1) * share)
         state = _State(np.concatenate([state.squares, squares[None]]), found)
         state.save(checkpoint, data.fingerprint())
-    best = _chosen(state.squares)
-    judged = np.stack([_elsewhere(state.squares, without, folds, f) for f in range(folds.count)])
+    best = _chosen(state.squares, counts)
+    candidates = np.concatenate([without[None], state.squares])
+    judged = [_elsewhere(candidates, counts, folds, f) for f in range(folds.count)]
+    decision = _decision(without, np.stack(judged), counts)
     near = [x.reshape(len(x), -1, len(b)).sum(2) for x, b in zip(state.latest, blocks, strict=True)]
     start = np.asarray(sum(near) / folds.count, np.float32)
-    tried = [(r, *_mean_gain(x, without)) for r, x in zip(ridges, state.squares, strict=False)]
-    return Verdict(ridges[best], best, tried, *_validation(judged, without, counts), start)
+    errors = [_decision(x, x, counts).after or 0.0 for x in state.squares]
+    return Verdict(ridges[best], best, list(zip(ridges, errors, strict=False)), decision, start)
 
 
 def _iterations(
@@ -214,93 +221,51 @@ def _iterations(
 
 def _squares(data: Data, folds: Folds, found: Sequence[Floats] | None) -> tuple[Array, Array]:
     """Squared errors of displayed values (products of two halves' errors, without noise) and their
-    counts by fold, view, light and group `(F, V, L, G)`, for each fold's coefficients in blocks, or
-    without a field."""
-    shape = folds.count, len(folds.views), len(folds.lights), len(GROUPS)
+    counts by fold, view, light and part of the hair `(F, V, L, B)`, for each fold's coefficients in
+    blocks, or without a field."""
+    shape = folds.count, len(folds.views), len(folds.lights), PARTS
     squares, counts = np.zeros((2, *shape))
     fine = [] if found is None else [np.asarray(data.nested @ x) for x in found]
     for i, (view, _) in enumerate(data.judges):
         fields = [data.judging(i, block) for block in fine]
         for light, part in enumerate(folds.lights):
-            used, halves = view.valid[light], view.halves[:, light]
+            used, halves = view.valid[light][:, None], view.halves[:, light]
             true = srgb(view.captured[light] * data.scale)
             lit = [field.lit(halves, [view.lights[light]] * 2) for field in fields]
             split = [x.reshape(*halves.shape, -1) for x in lit]
             shown = np.concatenate(split, axis=-1) if lit else halves[..., None]
             for fold in range(folds.count):
-                group = folds.group(fold, i, part)
-                if group is None:
+                if not folds.is_judged(fold, i, part):
                     continue
                 one, other = srgb(shown[..., fold if lit else 0] * data.scale) - true
-                squares[fold, i, light, group] = float((one * other)[used].sum())
-                counts[fold, i, light, group] = 3 * int(used.sum())
+                for values, of in ((one * other * used, squares), (3 * used, counts)):
+                    parts = np.array_split(values, PARTS)
+                    of[fold, i, light] = [float(x.sum()) for x in parts]
     return squares, counts
 
 
-def gains(squares: Array, without: Array) -> Array:
-    """Gain in dB of sums of squares over those `without`, of any one shape."""
-    ratio = np.maximum(without, 1e-30) / np.maximum(squares, 1e-30)
-    return np.asarray(10 * np.log10(np.clip(ratio, 1e-10, 1e10)))
+def _decision(before: Array, after: Array, counts: Array) -> Decision:
+    """`decide` by errors and counts of `_squares`."""
+    return decide("field", *(x.sum(axis=(0, 2)) for x in (before, after, counts)))
 
 
-def _mean_gain(squares: Array, without: Array) -> tuple[float, float]:
-    """The mean of the groups' gains in dB, and its standard error; both are `(F, V, L, G)`."""
-    there = without.sum((0, 1, 2)) > 0
-    if not there.any():
-        return 0.0, np.inf
-    a, b = squares[..., there], without[..., there]
-    mean = float(gains(a.sum((0, 1, 2)), b.sum((0, 1, 2))).mean())
-    return mean, float(spread_of(a, b, lambda x, y: gains(x, y).mean(axis=-1)))
-
-
-def spread_of(squares: Array, without: Array, of: Callable[[Array, Array], Array]) -> Array:
-    """The standard error of `of` the sums `(..., G)` of squares and of those without.
-
-    Jackknife variances over views and over lights add up. Infinite for one view and one light.
-    """
-    total: Any = np.inf if max(without.shape[1:3]) < 2 else 0.0
-    for others in ((0, 2), (0, 1)):
-        a, b = squares.sum(others), without.sum(others)
-        if len(a) > 1:
-            each = of(a.sum(0) - a, b.sum(0) - b)
-            total = total + (len(a) - 1) * np.var(each, axis=0)
-    return np.asarray(np.sqrt(total))
-
-
-def _chosen(candidates: Array) -> int:
-    """Index into errors `(R, F, V, L, G)`, strongest ridge first: the strongest whose loss against
-    the best is within its standard error."""
-    best = int(np.argmax([_mean_gain(x, candidates[0])[0] for x in candidates]))
+def _chosen(candidates: Array, counts: Array) -> int:
+    """Index into errors `(R, F, V, L, B)`, strongest ridge first: the strongest than which the best
+    is not better by more than its standard error."""
+    best = int(np.argmin(candidates.sum(axis=(1, 2, 3, 4))))
     for k in range(best):
-        gain, spread = _mean_gain(candidates[best], candidates[k])
-        if gain <= spread:
+        if not _decision(candidates[k], candidates[best], counts).kept:
             return k
     return best
 
 
-def _elsewhere(squares: Array, without: Array, folds: Folds, fold: int) -> Array:
-    """A fold's errors `(V, L, G)` at the ridge (or no field) chosen by the other folds on views and
-    lights that this fold does not leave out."""
+def _elsewhere(candidates: Array, counts: Array, folds: Folds, fold: int) -> Array:
+    """A fold's errors `(V, L, B)` at the ridge (or no field, the first candidate) chosen by the
+    other folds on views and lights that this fold does not leave out."""
     view, light = folds.parts(fold)
-    others = np.arange(folds.count) != fold
     views, lights = np.array(folds.views) != view, np.array(folds.lights) != light
-    candidates = np.concatenate([without[None], squares])
-    elsewhere = candidates[:, others][:, :, views][:, :, :, lights]
-    return np.asarray(candidates[_chosen(elsewhere)][fold])
-
-
-def _validation(
-    squares: Array, without: Array, counts: Array
-) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
-    """PSNR by group with the standard error of its gain; the mean gain with its standard error."""
-    a, b, n = (x.sum((0, 1, 2)) for x in (squares, without, counts))
-    each = spread_of(squares, without, gains)
-    found = {}
-    for k in np.flatnonzero(b > 0):
-        with_it, without_it = (float(-10 * np.log10(max(x[k] / n[k], 1e-10))) for x in (a, b))
-        spread = float(np.broadcast_to(each, a.shape)[k])
-        found[GROUPS[k]] = {"without": without_it, "with": with_it, "spread": spread}
-    return found, _mean_gain(squares, without)
+    elsewhere = (slice(None), *np.ix_(np.arange(folds.count) != fold, views, lights))
+    return np.asarray(candidates[_chosen(candidates[elsewhere], counts[elsewhere[1:]])][fold])
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from appearance.inverse_rendering.unknowns import Raw
+from appearance.metrics.decision import Decision
 from reconstruction.arrays import Array
 from reconstruction.files.durable import writing
 
 
 @dataclass
 class State:
-    """The state of a fit after so many `pieces`: `raw`, and factors on the intensities `gain (L,)`.
-
-    `left_open` and `history` are those of `Outcome`.
-    """
+    """The state of a fit after the stages of `decisions`: `raw`, and factors on the intensities
+    `gain (L,)`; `left_open` is that of `Outcome`."""
 
     raw: Raw
     gain: Array
-    pieces: int = 0
+    decisions: list[Decision] = field(default_factory=list)
     left_open: dict[str, float] = field(default_factory=dict)
-    history: list[tuple[float, float]] = field(default_factory=list)
 
     def save(self, path: Path | None, fingerprint: str) -> None:
         """Write the state, whole or not at all; nothing where `path` is None."""
@@ -32,9 +30,8 @@ class State:
             return
         numbers = {
             "fingerprint": fingerprint,
-            "pieces": self.pieces,
+            "decisions": [asdict(x) for x in self.decisions],
             "left_open": self.left_open,
-            "history": self.history,
         }
         arrays = {f"raw/{name}": value for name, value in self.raw.items()} | {"gain": self.gain}
         with writing(path) as part:
@@ -50,5 +47,5 @@ class State:
             if numbers["fingerprint"] != fingerprint:
                 return None
             raw = {k.removeprefix("raw/"): data[k] for k in data.files if k.startswith("raw/")}
-            history = [(float(seconds), float(error)) for seconds, error in numbers["history"]]
-            return cls(raw, data["gain"], numbers["pieces"], numbers["left_open"], history)
+            decisions = [Decision(**x) for x in numbers["decisions"]]
+            return cls(raw, data["gain"], decisions, numbers["left_open"])

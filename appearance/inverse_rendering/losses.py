@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from reconstruction.arrays import Array, Bools
+from reconstruction.arrays import Array
 
 FLOOR = 0.03
 LEAST_NOISE = 0.1
@@ -54,11 +54,3 @@ def noise_weighted(weight: Array, squares: Array) -> Array:
         return weight
     out = weight / (1 + LEAST_NOISE + relative / usual)
     return np.asarray(out * (weight.sum() / out.sum()))
-
-
-def squares(one: Array, other: Array, weight: Array, valid: Bools) -> float:
-    """Weighted mean square of the differences `one`, `other (L, P, 3)` of independent renderings.
-
-    Without their noise: may be slightly negative where the renderings agree with the captured.
-    """
-    return float((one * other * weight)[valid].mean()) if valid.any() else 0.0

@@ -20,9 +20,6 @@ from appearance.scene.hair_scene import HairScene, light_arrays
 from reconstruction import Camera, Light
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 
-ValidationSet = Sequence[tuple[Patch, Array]]
-"""Patches, and the share `(k, P, 3)` of its weight that each value keeps."""
-
 _DIRECT_PATHS, _FEWEST, _MOST = 400_000, 4, 16
 """Cached one-vertex paths of all views, and fewest and most per pixel."""
 _ALL = 1e-9
@@ -30,7 +27,7 @@ _ALL = 1e-9
 _LEAST_SPP = 16
 """Least paths a pixel of indirect light."""
 _WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
-"""Paths of full images of all views, least paths a pixel, and about how many parts of the hair."""
+"""Paths of full images of all views, least paths a pixel, and parts of a view's hair."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights sampled at a path's first and later vertices, for means over lights."""
 
@@ -69,7 +66,7 @@ class FitProblem:
     ) -> None:
         self.mapped, self.views, self.scale, self.skin = mapped, tuple(views), scale, skin
         self.lights: tuple[Light, ...] = views[0].lights if views else ()
-        self._scene: HairScene | None = None
+        self._scenes: list[HairScene] = []
         self._level = [
             losses.level(o.radiance.astype(float) * scale).astype(np.float32) for o in self.views
         ]
@@ -79,34 +76,28 @@ class FitProblem:
         few = np.sort(rng.permutation(len(self.views[batch.view].pixels))[:pixels])
         return Patch(batch.view, batch.lights, few)
 
-    def error(
-        self, raw: Raw, gain: Array, validation: ValidationSet, effort: Effort, seed: int
-    ) -> float:
-        """Weighted mean squared difference, noise taken off, at `gain (L,)`, of fixed seeds."""
-        values = []
-        for patch, share in validation:
-            a, b = self._twice(raw, gain, patch, effort, seed)
-            one, other = (x.rendered - x.captured for x in (a, b))
-            weight = share * losses.weights(0.5 * (a.level + b.level))
-            values.append(losses.squares(one, other, weight, a.valid))
-        return float(np.mean(values)) if values else 0.0
+    def part(self, views: Ints, lights: Ints) -> FitProblem:
+        """Some of the views under some of the lights, by their numbers; the scene is shared."""
+        few = [self.views[k].under(lights) for k in views]
+        out = FitProblem(self.mapped, few, self.scale, self.skin)
+        out._scenes = self._scenes
+        return out
 
-    def full_image_errors(
+    def squares(
         self, guesses: Sequence[tuple[Raw, Array]], used: Bools, effort: Effort, seed: int
-    ) -> Array:
-        """The errors of full images by part of the hair, of each guess `(G, B)`.
+    ) -> tuple[Array, Array]:
+        """Sums of weighted squared errors of each guess `(G, V, B)`, and their counts `(V, B)`.
 
-        Their mean over B is the weighted mean squared difference, without noise, of all hair pixels
-        of the pairs `used (V, L)`, with the same weights for all guesses. A part is a ninth of a
-        view's pixels under all its lights, with own paths.
+        Of all hair pixels of the V views of the pairs `used (V', L)`, without noise, under the same
+        weights for all guesses. The B parts are a view's pixels, with own paths, in image order.
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
         paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
         spent = {
-            "spp": int(np.clip(paths, _LEAST_PATHS, 2 * effort.spp)),
+            "spp": int(np.clip(paths, _LEAST_PATHS, 8 * effort.spp)),
             "max_depth": effort.max_depth,
         }
-        parts, counted = [], 0
+        sums, counts = [], []
         for k in views:
             o, lights = self.views[k], np.flatnonzero(used[k])
             patch = Patch(k, lights, np.arange(len(o.pixels)))
@@ -122,32 +113,11 @@ class FitProblem:
             rendered = losses.level(halves.mean(axis=(0, 1)))
             weight = losses.weights(0.5 * (self._level[k][lights] + rendered))
             product = (halves - o.radiance[lights] * self.scale).prod(axis=1)
-            squares = (product * weight * o.valid[lights][..., None]).sum(axis=(1, 3))
-            slices = np.array_split(squares, min(_PARTS, len(o.pixels)), axis=1)
-            parts += [x.sum(axis=1) for x in slices]
-            counted += 3 * int(o.valid[lights].sum())
-        return np.array(parts).T * (len(parts) / max(counted, 1))
-
-    def validation(
-        self, raw: Raw, gain: Array, pairs: Sequence[Batch], effort: Effort, seed: int
-    ) -> ValidationSet:
-        """What `error` observes: pixels of `pairs`, weighted by noise about `raw`, `gain (L,)`."""
-        out = []
-        for batch in pairs:
-            patch = self.patch(batch, effort.pixels, np.random.default_rng(seed))
-            a, b = self._twice(raw, gain, patch, effort, seed + (1 << 22))
-            weight = np.where(a.valid[..., None], losses.weights(0.5 * (a.level + b.level)), 0)
-            kept = losses.noise_weighted(weight, (a.rendered - b.rendered) ** 2)
-            share = np.divide(kept, weight, out=np.zeros_like(weight), where=weight > 0)
-            out.append((patch, share))
-        return out
-
-    def _twice(
-        self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int
-    ) -> tuple[Comparison, Comparison]:
-        """Two independent images beside what was captured."""
-        one, other = (self.render(raw, gain, patch, effort, seed + k) for k in (0, 1 << 20))
-        return self.compare(patch, one), self.compare(patch, other)
+            valid = o.valid[lights][..., None]
+            squares = (product * weight * valid).sum(axis=(1, 3))
+            sums.append(_parts(squares))
+            counts.append(_parts(3.0 * valid.sum(axis=(0, 2))))
+        return np.stack(sums, axis=1), np.stack(counts)
 
     def compare(self, patch: Patch, rendered: Array) -> Comparison:
         """`rendered (k, P, 3)` beside what was captured of a patch, `(P,)` pixels."""
@@ -225,10 +195,10 @@ class FitProblem:
     def _scene_of(self, raw: Raw) -> HairScene:
         """The one scene of this problem, as `raw` has it."""
         maps = decode(raw)
-        if self._scene is None:
-            self._scene = self.mapped.with_maps(maps).with_skin(self.skin)
-        self._scene = self.mapped.update_maps(self._scene, maps)
-        return self._scene
+        if not self._scenes:
+            self._scenes.append(self.mapped.with_maps(maps).with_skin(self.skin))
+        self._scenes[0] = self.mapped.update_maps(self._scenes[0], maps)
+        return self._scenes[0]
 
     def _setup(
         self, raw: Raw, gain: Array, patch: Patch
@@ -240,3 +210,8 @@ class FitProblem:
             for i in patch.lights
         ]
         return self._scene_of(raw), o.camera, lights, o.pixels[patch.few]
+
+
+def _parts(values: AnyFloats) -> Array:
+    """Sums over `_PARTS` parts of the pixels of `values (…, P)`: `(…, B)`."""
+    return np.stack([x.sum(-1) for x in np.array_split(values, _PARTS, axis=-1)], axis=-1)

@@ -8,6 +8,7 @@ PIPELINES: dict[str, tuple[str, ...]] = {
         "reconstruct",
         "fit",
         "inverse_rendering",
+        "fields",
         "relight",
         "assess",
         "evaluate",
@@ -15,9 +16,7 @@ PIPELINES: dict[str, tuple[str, ...]] = {
         "compress",
     ),
     "reconstruct": ("reconstruct", "evaluate", "results"),
-    "fit": ("fit", "relight", "assess", "results"),
-    "appearance": ("fit", "inverse_rendering", "relight", "assess", "results"),
-    "fields": ("fit", "inverse_rendering", "fields", "relight", "assess", "results"),
+    "fit": ("fit", "inverse_rendering", "fields", "relight", "assess", "results"),
 }
 """Each step is a checkpoint: after a crash the job resumes at the step that was under way.
 The result comes first; comparisons and compression delay nobody."""
@@ -38,5 +37,5 @@ SECONDS = {
 RENDERING = frozenset({"fit", "inverse_rendering", "fields", "relight", "assess"})
 """Steps that run several times faster on a GPU."""
 
-STEPS_VERSION = "6"
+STEPS_VERSION = "7"
 """Raise it when a pipeline's steps change: jobs of another version are not resumed."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from appearance import FieldRequest, InverseRenderingRequest
+from appearance.metrics.decision import MATERIAL, STAGES, FitStage, with_needed
 from appearance.model.options import AssessOptions
 from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
+from reconstruction.deprecated import new_name
 from reconstruction.methods import Method
 from stage_service.config import Names, Strict, Text
 from stage_service.jobs.pipelines import PIPELINES
@@ -31,7 +33,8 @@ class JobOptions(Strict):
     validate the result. `label` is shown on the model's page. `truth` is a strand file to evaluate
     against, with baselines of strands unless `baselines` is false, or a folder with `strands.npz`
     and `appearance.json`; `environment` a `.hdr` or `.exr` file, `studio` or `sky`. With `reduced`
-    n every step works on means over n × n pixels.
+    n every step works on means over n × n pixels. `stages` are those of the fit; one that starts
+    from another includes it.
     `reconstruct`, `fit`, `inverse_rendering`, `fields` and `assess` are the options of the step of
     that name; those of `assess` include the relit pictures'.
     """
@@ -46,11 +49,34 @@ class JobOptions(Strict):
     environment: str = "studio"
     truth: str | None = None
     seed: int = Field(default=0, ge=0, lt=2**32)
+    stages: Annotated[tuple[FitStage, ...], Field(min_length=1)] = STAGES
     reconstruct: ReconstructOptions = Field(default_factory=ReconstructOptions)
     fit: FitOptions = Field(default_factory=FitOptions)
     inverse_rendering: InverseRenderingRequest = Field(default_factory=InverseRenderingRequest)
     fields: FieldRequest = Field(default_factory=FieldRequest)
     assess: AssessOptions = Field(default_factory=AssessOptions)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _variant_as_stages(cls, given: Any) -> Any:
+        """Read `inverse_rendering.fit.variant`, which names the last of its stages."""
+        try:
+            last = given["inverse_rendering"]["fit"]["variant"]
+        except (KeyError, TypeError):
+            return given
+        names = ["shared" if last == "original" else last]
+        if last in MATERIAL:
+            names = [*MATERIAL[: MATERIAL.index(last) + 1]]
+        fields = [name for name in given.get("stages", ()) if name == "field"]
+        inverse = given["inverse_rendering"]
+        fit = {key: value for key, value in inverse["fit"].items() if key != "variant"}
+        stages = {new_name("options", "inverse_rendering.fit.variant"): ["sun", *names, *fields]}
+        return {**given, **stages, "inverse_rendering": {**inverse, "fit": fit}}
+
+    @field_validator("stages")
+    @classmethod
+    def _with_needed(cls, stages: tuple[FitStage, ...]) -> tuple[FitStage, ...]:
+        return with_needed(stages)
 
     @field_validator("reconstruct")
     @classmethod
@@ -85,6 +111,7 @@ class PipelineRequest(Strict):
     @field_validator("name")
     @classmethod
     def _known(cls, name: str) -> str:
+        name = new_name("pipeline", name)
         if name not in PIPELINES:
             raise ValueError(f"there is no pipeline {name!r}; there are {sorted(PIPELINES)}")
         return name

@@ -68,30 +68,41 @@ def reconstruct(context: StepContext) -> Figures:
 def fit(context: StepContext) -> Figures:
     """Roughness and colour of hair and skin: `appearance.json`."""
     from appearance import fit as run
+    from appearance.sun_fit.fitted_appearance import FittedAppearance
 
-    run(**context.for_appearance(), options=context.options.fit)
+    given = context.for_appearance()
+    if "sun" not in context.options.stages and FittedAppearance.is_of(
+        context.model, given["held_out"]
+    ):
+        return {"left_out": "the model has a fit that did not observe the held-out frames"}
+    run(**given, options=context.options.fit)
     return {"appearance": "appearance.json"}
 
 
 def inverse_rendering(context: StepContext) -> Figures:
     """The hair's maps and the lights by inverse rendering: `hair_maps.npz`, `lights.json`.
 
-    Discarded if Sun's fit is better on frames that neither was fitted to. If killed, it resumes
-    from its checkpoint.
+    If killed, it resumes from its checkpoint.
     """
-    from appearance import fit_validated as run
+    from appearance import fit_maps as run
+    from appearance.metrics.decision import MATERIAL
 
-    return run(**context.for_appearance(), request=context.options.inverse_rendering)
+    stages = [name for name in MATERIAL if name in context.options.stages]
+    if not stages:
+        return {"left_out": "no stage of inverse rendering was requested"}
+    request = context.options.inverse_rendering
+    return run(**context.for_appearance(), stages=stages, request=request)
 
 
 def fields(context: StepContext) -> Figures:
     """A field of reflectance on top of the material: `field.npz`.
 
-    Discarded if images that it was not fitted to are better without it. If killed, it resumes after
-    the last finished view.
+    If killed, it resumes after the last finished view.
     """
     from appearance import fit_field_validated as run
 
+    if "field" not in context.options.stages:
+        return {"left_out": "the stage was not requested"}
     return run(**context.for_appearance(), request=context.options.fields)
 
 
@@ -156,7 +167,7 @@ def results(context: StepContext) -> Figures:
         ("inverse_rendering", "inverse_rendering"),
         ("fields", "field"),
     ):
-        if step in done:
+        if step in done and "left_out" not in done[step]:
             figures[name] = done[step]
     if "visible" in done.get("evaluate", {}):
         geometry = dict(done["evaluate"])

@@ -40,7 +40,6 @@ SHOWN = {
     "relit.png": "The result under a new environment map.",
     "relit.webp": "The same under the turning environment.",
     "comparison.png": "Held-out frames: captured, rendered, and baselines.",
-    "inverse_rendering.png": "Held-out frames before and after inverse rendering, error maps.",
     "render.png": "The latest image of hairstage render.",
     "plots/geometry.png": "Strands, baselines and true directions against the true strands.",
 }

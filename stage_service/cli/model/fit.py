@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from reconstruction.deprecated import new_name
 from stage_service.cli.support.commands import (
     BadArgument,
     Commands,
@@ -16,25 +18,30 @@ from stage_service.cli.support.commands import (
     read_json,
 )
 
-METHODS = ("sun", "inverse_rendering")
-FIELDS = ("none", "modulation", "additive")
+if TYPE_CHECKING:
+    from reconstruction import Capture, Model
+    from stage_service.jobs.records import JobOptions
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    remains = "the same command resumes inverse_rendering and fields, and begins a sun fit anew"
+    remains = "the same command resumes inverse rendering and fields, and begins a sun fit anew"
     fit = add_command(commands, "fit", run, interrupted=remains)
     fit.add_argument("capture", type=Path)
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
-    fit.add_argument("--method", choices=METHODS, default="sun")
-    fit.add_argument("--options", help="the method's options as JSON")
     fit.add_argument(
-        "--field",
-        choices=FIELDS,
-        help="also fit a field of reflectance over the material: a smooth factor on its radiance "
-        "(modulation) or radiance added to it (additive); none removes it",
+        "--stages",
+        type=lambda text: text.split(","),
+        help="only some of sun, shared, spatial, correctives, lights, field, separated by commas; "
+        "default: all",
     )
-    fit.add_argument("--field-options", help="the field's options as JSON")
+    fit.add_argument(
+        "--estimate", action="store_true", help="only estimate seconds and memory of each stage"
+    )
+    fit.add_argument("--options", help="options of fit, inverse_rendering and fields as JSON")
+    fit.add_argument("--method", choices=("sun", "inverse_rendering"), help=argparse.SUPPRESS)
+    fit.add_argument("--field", choices=("none", "modulation", "additive"), help=argparse.SUPPRESS)
+    fit.add_argument("--field-options", help=argparse.SUPPRESS)
     add_view(fit)
     fit.add_argument(
         "--environment",
@@ -48,68 +55,91 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace, output: Output) -> None:
     """Fit the hair's appearance from a capture and its strands.
 
-    Write MODEL/appearance.json: roughness and colour of hair and skin (method sun).
-    inverse_rendering starts from a sun fit, which is made first if none held out the same cameras
-    and lights. It estimates roughness and colour by rendering: uniform or, with --options '{"fit":
-    {"variant": "lights"}}', over the scalp and along strands, together with the lights, in
-    MODEL/hair_maps.npz and lights.json. An interrupted run is resumed. --field writes
-    MODEL/field.npz, the reflectance that the material lacks; an existing fit is used if it held out
-    the same and --options is not given. Held-out cameras and lights are used to score the model.
+    Stages in order: sun (roughness and colour from highlights, MODEL/appearance.json), shared
+    (both by rendering), spatial (colour over the scalp and along strands), correctives (rotations
+    of the fibres), lights (their intensities; MODEL/hair_maps.npz and lights.json), and field (the
+    reflectance that the material lacks; MODEL/field.npz). Each after the first is kept if it lowers
+    the error on frames that took no part by more than its standard error. --stages without sun uses
+    an existing sun fit that held out the same. Held-out cameras and lights score the model.
     """
-    from appearance import HeldOut
     from appearance.render.environment_maps import environment_map
-    from appearance.sun_fit.fitted_appearance import FittedAppearance
-    from reconstruction import Model, parse_options
+    from reconstruction import Capture, Model, parse_options
     from stage_service.jobs.records import JobOptions
-    from stage_service.jobs.steps import (
-        StepContext,
-        assess,
-        fields,
-        fit,
-        inverse_rendering,
-        relight,
-    )
+    from stage_service.jobs.steps import STEPS, StepContext
     from stage_service.model_page import write_page
 
-    if args.field_options and args.field in (None, "none"):
-        raise BadArgument("--field-options needs --field")
-    of_field = read_json(args.field_options)
-    if "field" in of_field:
-        raise BadArgument("--field-options may not set field: use --field")
-    of_method = read_json(args.options)
-    model, inverse = Model(args.model), args.method == "inverse_rendering"
+    model = Model(args.model)
     given = {
         "held_out_cameras": args.hold_out_camera,
         "held_out_lights": args.hold_out_light,
         "reduced": args.reduce,
         "environment": args.environment,
         "seed": args.seed,
-        "inverse_rendering" if inverse else "fit": of_method,
-        "fields": {"field": args.field or "none", **of_field},
+        **_stages(args),
     }
     options = parse_options(JobOptions, given)
     environment_map(options.environment)  # fail before the work
-    data: dict[str, Any] = {"model": str(model), "method": args.method}
-    held_out = HeldOut(options.held_out_cameras, options.held_out_lights)
-    there = FittedAppearance.is_of(model, held_out)
-    if not (there and (inverse or (args.field and not of_method))):
-        with progress_bar("sun") as progress:
-            fit(StepContext(args.capture, model, options, progress))
-    if inverse:
-        with progress_bar("inverse") as progress:
-            data |= inverse_rendering(StepContext(args.capture, model, options, progress))
-    if args.field:
-        with progress_bar("field") as progress:
-            context = StepContext(args.capture, model, options, progress)
-            data["field"] = fields(context)
+    if args.estimate:
+        _estimate(Capture(args.capture).view(reduced=args.reduce), model, options, output)
+        return
+    data: dict[str, Any] = {"model": str(model), "stages": []}
+
+    def step(name: str) -> dict[str, Any]:
+        with progress_bar(name.split("_")[0]) as progress:
+            return STEPS[name](StepContext(args.capture, model, options, progress))
+
+    for name in ("fit", "inverse_rendering", "fields"):
+        found = step(name)
+        data |= {} if "left_out" in found else {name: found}
+        for stage in found.get("stages", ()):
+            output.note(stage["line"])
+            data["stages"].append(stage)
     data["appearance"] = model.json("appearance.json")
     if options.held_out_cameras or options.held_out_lights:
-        with progress_bar("assess") as progress:
-            context = StepContext(args.capture, model, options, progress)
-            relight(context)
-            data["images"] = assess(context)
+        step("relight")
+        data["images"] = step("assess")
     write_page(model)
     data["warnings"] = [f"{s.name}: {w}" for s in model.report().stages for w in s.warnings]
     for warning in data["warnings"]:
         output.note(f"warning: {warning}")
     output.result(data)
+
+
+def _estimate(capture: Capture, model: Model, options: JobOptions, output: Output) -> None:
+    """Print the estimated cost of each stage."""
+    from appearance import HeldOut, estimate_fit
+
+    costs = estimate_fit(
+        capture,
+        model,
+        held_out=HeldOut(options.held_out_cameras, options.held_out_lights),
+        stages=options.stages,
+        request=options.inverse_rendering,
+        field=options.fields,
+    )
+    lines = [f"{x.name:<12}{x.seconds:8.0f} s{x.peak_gb:8.1f} GB" for x in costs]
+    total = sum(x.seconds for x in costs)
+    lines.append(f"{total:.0f} s in all on this machine when idle, without reading frames.")
+    output.result({"stages": [asdict(x) for x in costs], "seconds": total}, "\n".join(lines))
+
+
+def _stages(args: argparse.Namespace) -> dict[str, Any]:
+    """The job's options by those of the command, old ones too."""
+    given, stages = read_json(args.options), args.stages
+    if args.method:
+        new_name("hairstage fit", "--method")
+        inverse = args.method == "inverse_rendering"
+        stages = stages or ["shared" if inverse else "sun"]
+        given = {"inverse_rendering" if inverse else "fit": given}
+    elif given and not given.keys() & {"fit", "inverse_rendering", "fields"}:
+        given = {"fit": given}  # as without --method before 0.2
+    if args.field_options and args.field in (None, "none"):
+        raise BadArgument("--field-options needs --field")
+    if args.field:
+        new_name("hairstage fit", "--field")
+        stages = [*(stages or ()), "field"]
+        of_field = read_json(args.field_options)
+        if "field" in of_field:
+            raise BadArgument("--field-options may not set field: use --field")
+        given["fields"] = {**of_field, "field": args.field}
+    return {**given, "stages": stages} if stages else given

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from appearance.inverse_rendering.checkpoint import State
+from appearance.metrics.decision import Decision
 from reconstruction.files import durable
 
 
 def state(value: float) -> State:
     raw = {"beta_m": np.array([value])}
-    return State(raw, np.ones(2))
+    return State(raw, np.ones(2), [Decision("shared", value, 0.5, 0.1)])
 
 
 def test_a_state_is_on_the_disk_before_it_replaces_the_one_before_it(tmp_path, monkeypatch):
@@ -26,4 +27,5 @@ def test_a_state_is_on_the_disk_before_it_replaces_the_one_before_it(tmp_path, m
     found = State.load(file, "a")
     assert found.raw["beta_m"] == 1.0
     assert found.gain.tolist() == [1.0, 1.0]
+    assert found.decisions == [Decision("shared", 1.0, 0.5, 0.1)]
     assert State.load(file, "b") is None

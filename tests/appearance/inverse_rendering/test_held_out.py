@@ -1,44 +1,68 @@
-"""Held-out frames beside what a fit makes of them."""
+"""The frames that decide take no part in a fit, and have no noise of renderings in their errors."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from appearance import Exposure
 from appearance.bsdf.maps import HairMaps
-from appearance.inverse_rendering.held_out import Judged, judge
-from appearance.render.tracing import Sampling
-from reconstruction import Model, Rig
-
-SAMPLING = Sampling(64, 6)
-
-
-@pytest.fixture
-def judged(plain, tufted, tmp_path):
-    """`judged(frame)`: what `judge` says of the tuft's true hair beside one captured frame."""
-    rig = Rig("tuft", tuple(o.camera for o in plain.views), plain.lights)
-    truth = Judged(tufted.mapped.with_maps(HairMaps.of(tufted.truth)), rig)
-    model = Model(tmp_path / "model").create()
-
-    def of(frame):
-        return judge(model, [frame], {"truth": truth}, Exposure(plain.scale), SAMPLING)
-
-    return of
+from appearance.inverse_rendering.held_out import Split
+from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.problem import FitProblem
+from appearance.inverse_rendering.unknowns import encode
+from appearance.observations import Observed
+from reconstruction import Camera, Light
+from reconstruction.geometry.lights import dome_positions
 
 
-def test_saturated_pixels_of_a_held_out_frame_say_nothing(plain, judged):
-    """Whether they read what is there, or a tenth of it."""
-    whole = plain.views[0].under(np.array([0]))
-    bright = whole.radiance.max(axis=-1) > np.quantile(whole.radiance.max(axis=-1), 2 / 3)
-    cut = np.where(bright[..., None], 0.1 * whole.radiance, whole.radiance)
-    of_rest = judged(replace(whole, valid=~bright))
-    assert judged(replace(whole, radiance=cut, valid=~bright)) == of_rest
-    assert of_rest != judged(whole)
+def problem_of(views: int, lights: int) -> FitProblem:
+    """Flat frames, each of its own brightness."""
+    stage = tuple(
+        Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(lights, 1.0, -60.0))
+    )
+    out = []
+    for k in range(views):
+        camera = Camera.look_at(f"c{k}", 10, 10, (0, -1, 0), (0, 0, 0), 20)
+        level = 1 + 0.01 * (100 * k + np.arange(lights, dtype=np.float32))
+        radiance = np.repeat(level[:, None, None], 50, axis=1).repeat(3, axis=2)
+        valid = np.ones(radiance.shape[:2], bool)
+        out.append(Observed(camera, stage, np.arange(50), radiance, valid))
+    return FitProblem(None, out, 1.0, np.ones(3))
 
 
-def test_a_frame_that_is_saturated_everywhere_is_left_out(plain, judged):
-    one = plain.views[0].under(np.array([0]))
-    assert judged(replace(one, valid=np.zeros_like(one.valid))) == {}
+@pytest.mark.parametrize(
+    ("views", "lights", "held", "counts"),
+    [(7, 16, 4, (6, 12)), (3, 8, 2, (3, 6)), (4, 3, 0, (3, 3)), (1, 1, 0, (1, 1))],
+)
+def test_no_frame_is_both_fitted_and_held_out(views, lights, held, counts):
+    problem = problem_of(views, lights)
+    split = Split.of(problem, held)
+    fitted = {float(x) for o in split.training.views for x in o.radiance[:, 0, 0]}
+    decide = {float(problem.views[k].radiance[i, 0, 0]) for k, i in np.argwhere(split.held_out)}
+    assert (len(split.training.views), len(split.training.lights)) == counts
+    assert len(fitted) == counts[0] * counts[1]
+    assert not fitted & decide
+    assert len(fitted | decide) == views * lights
+
+
+def test_the_errors_of_the_truth_are_zero_without_the_noise_of_few_paths(tufted):
+    problem = tufted.problem(spp=4096)
+    truth, effort = encode(HairMaps.of(tufted.truth)), Effort(spp=4, max_depth=6)
+    gain, used = np.ones(8), np.ones((2, 8), bool)
+    (right, bright), counts = problem.squares(
+        [(truth, gain), (truth, 1.5 * gain)], used, effort, seed=3
+    )
+    assert right.shape == counts.shape == (2, 9)
+    assert counts.sum() == 3 * sum(o.valid.sum() for o in problem.views)
+    assert abs(right.sum()) < 0.1 * bright.sum()
+
+
+def test_saturated_pixels_do_not_count(plain, tufted):
+    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.ones((2, 8), bool)
+    cut = plain.part(np.arange(2), np.arange(8))
+    for o in cut.views:
+        o.valid[:, ::2] = False
+        o.radiance[:, ::2] = 1e9
+    (squares,), counts = cut.squares([guess], used, Effort(spp=16, max_depth=6), seed=3)
+    assert counts.sum() == 3 * sum(o.valid.sum() for o in cut.views)
+    assert squares.sum() < counts.sum()

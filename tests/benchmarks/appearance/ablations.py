@@ -38,7 +38,6 @@ from reconstruction import Progress, read_strands, silent
 from reconstruction.arrays import Array
 
 OPTIONS = InverseRenderingOptions(
-    variant="lights",
     free_index=True,
     shape=(6, 24, 24),
     effort=Effort(pixels=400, spp=512, max_depth=8),
@@ -113,7 +112,7 @@ def run_bench(
                 table = Table(
                     captured, options, progress=within(progress, f"({name})"), seed=seed + k
                 )
-                found.append(_final(table.run(("original", "spatial"))))
+                found.append(_final(table.run(("shared", "spatial"))))
             shared = [n for n in found[0] if all(n in f for f in found)]
             result["seeds"] = {name: {n: spread([f[n] for f in found]) for n in shared}}
             _write(out, result)
@@ -168,7 +167,7 @@ def recovery(
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """What is recovered from frames with noise, and with lights 2 mm and 3 % off their calibration.
 
-    `variants` are those of the table of the frames as they are. The variant "original" (lights
+    `variants` are those of the table of the frames as they are. The stage "shared" (lights
     as calibrated) and, with lights off, "lights" (lights fitted too).
     """
     rng = np.random.default_rng([seed, 9])
@@ -202,13 +201,13 @@ def recovery(
         progress=within(progress, f"({name})"),
         seed=seed,
     )
-    out[name] = _recovered(table.run(("original",)))
+    out[name] = _recovered(table.run(("shared",)))
     name = "lights 2 mm and 3 % off"
     table = Table(captured, options, lights=off, progress=within(progress, f"({name})"), seed=seed)
-    out[name] = _recovered(table.run(("original", "lights")))
+    out[name] = _recovered(table.run(("shared", "lights")))
     true = np.array([lights[i].intensity[0] for i in captured.train_lights])
     known = np.array([off[i].intensity[0] for i in captured.train_lights])
-    out[name]["original"]["lights_off"] = _relative_spread(known / true)
+    out[name]["shared"]["lights_off"] = _relative_spread(known / true)
     out[name]["lights"]["lights_off"] = _relative_spread(known * table.found[1] / true)
     return out
 
@@ -216,7 +215,7 @@ def recovery(
 def from_afar(
     captured: Captured, options: InverseRenderingOptions, progress: Progress = silent, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """What the variant "original" finds of one colour from `STARTS`, and in what time."""
+    """What the stage "shared" finds of one colour from `STARTS`, and in what time."""
     true, out = captured.truth.mean(), []
     problem = FitProblem(
         captured.mapped, captured.training(), captured.exposure.scale, captured.skin
@@ -226,14 +225,12 @@ def from_afar(
         start = replace(true, sigma_a=sigma_a, beta_m=beta_m, beta_n=beta_n, eta=eta)
         progress(f"from β_M {beta_m:g}, β_N {beta_n:g}", 0.0)
         begun = time.process_time()
-        found = run(
-            problem, HairMaps.of(start), options=replace(options, variant="original"), seed=seed
-        )
+        found = run(problem, HairMaps.of(start), stages=("shared",), options=options, seed=seed)
         hair = found.maps.mean()
         out.append(
             {
                 "start": start.to_dict(),
-                "ended": found.ended,
+                "decision": found.decisions[0].to_dict(),
                 "beta_m_error": hair.beta_m / true.beta_m - 1,
                 "beta_n_error": hair.beta_n / true.beta_n - 1,
                 "eta": hair.eta,
@@ -249,7 +246,7 @@ def _recovered(variants: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]
     return {
         name: {"psnr_clean": variant[GROUPS[1]]["psnr_clean"], **{k: variant[k] for k in wanted}}
         for name, variant in variants.items()
-        if name in ("HairInverse", "original", "lights")
+        if name in ("HairInverse", "shared", "lights")
     }
 
 
@@ -318,7 +315,6 @@ def _off(found: dict[str, Any]) -> str:
 
 
 QUICK = InverseRenderingOptions(
-    variant="lights",
     free_index=True,
     shape=(2, 2, 2),
     effort=Effort(pixels=40, spp=4, max_depth=4),

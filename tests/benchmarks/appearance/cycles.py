@@ -35,7 +35,6 @@ from reconstruction.arrays import AnyFloats
 HELD_CAMERAS = (0, 4)
 HELD_LIGHTS = (1, 3, 5, 7, 9)
 OPTIONS = InverseRenderingOptions(
-    variant="original",
     free_index=True,
     effort=Effort(pixels=300, spp=384, max_depth=12),
 )
@@ -142,12 +141,17 @@ def fit_cycles(
     mapped = MappedStrands.of(frames.scene, strands, scalp_coordinates(strands, None))
     problem = FitProblem(mapped, frames.hair, exposure.scale, albedo)
     found = run(
-        problem, HairMaps.of(start), options=options, monitor=Monitor(progress), seed=frames.seed
+        problem,
+        HairMaps.of(start),
+        stages=("shared",),
+        options=options,
+        monitor=Monitor(progress),
+        seed=frames.seed,
     )
     mean = np.mean([o.radiance.mean((0, 1)) for o in frames.hair], axis=0)
     flat = [np.broadcast_to(mean, o.radiance.shape) for o in frames.held]
     scores = {"mean colour": _psnr(flat, frames.held, exposure)}
-    for name, maps in (("start", HairMaps.of(start)), ("original", found.maps)):
+    for name, maps in (("start", HairMaps.of(start)), ("shared", found.maps)):
         progress(f"judging {name}", 0.9)
         scene = mapped.with_maps(maps).with_skin(albedo)
         pictures = [
@@ -165,12 +169,11 @@ def fit_cycles(
         scores[name] = _psnr(pictures, frames.held, exposure)
     return {
         "psnr_held_out": scores,
-        "ended": found.ended,
+        "decision": found.decisions[0].to_dict(),
         "skin": albedo.tolist(),
         "warnings": stage.warnings,
         "start": _against(start, frames.truth),
         "found": _against(found.maps.mean(), frames.truth),
-        "history": found.history,
     }
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from appearance import InverseRenderingOptions, scores
 from appearance.bsdf.maps import HairMaps, MappedStrands
-from appearance.inverse_rendering.loop import VARIANTS, Monitor, run
+from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.memory import Sizes, memory_needed
-from appearance.inverse_rendering.options import Variant
 from appearance.inverse_rendering.problem import FitProblem
+from appearance.metrics.decision import MATERIAL, Material
 from appearance.metrics.scores import mean_scores, scores_unavailable
 from appearance.observations import Observed
 from appearance.sun_fit.options import FitOptions
@@ -54,7 +53,7 @@ class Table:
         self.training = captured.training(lights)
         self.variants: dict[str, dict[str, Any]] = {}
 
-    def run(self, variants: Sequence[Variant] = tuple(VARIANTS)) -> dict[str, dict[str, Any]]:
+    def run(self, variants: Sequence[Material] = MATERIAL) -> dict[str, dict[str, Any]]:
         """Baselines, then `variants`, then the truth itself."""
         captured = self.captured
         colour = np.mean([o.radiance.mean((0, 1)) for o in self.training], axis=0)
@@ -86,14 +85,14 @@ class Table:
             begun = time.perf_counter()
             self.progress(variant, 0.0)
             worked = time.process_time()
-            options = replace(self.options, variant=variant)
             held = resident_memory() or 0.0
             with peak_memory() as peak:
                 found = run(
                     problem,
                     maps,
                     gain,
-                    options=options,
+                    stages=(variant,),
+                    options=self.options,
                     seed=self.seed,
                     monitor=Monitor(within(self.progress, f"({variant})")),
                 )
@@ -103,10 +102,9 @@ class Table:
             self.variants[variant] |= {
                 "cpu_seconds": worked,
                 "memory_gb": peak.gb,
-                "memory_told_gb": held + memory_needed(sizes, options),
-                "ended": found.ended,
+                "memory_told_gb": held + memory_needed(sizes, self.options),
+                "decision": found.decisions[0].to_dict(),
                 "gain_spread": float(found.gain.std()),
-                "history": found.history,
             }
         self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
         self.found = maps, np.ones(len(self.training[0].lights)) if gain is None else gain

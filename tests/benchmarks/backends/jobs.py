@@ -15,7 +15,7 @@ import numpy as np
 
 from appearance import InverseRenderingOptions, render_olat
 from appearance.bsdf import lobes, reference
-from appearance.inverse_rendering.options import Variant
+from appearance.metrics.decision import MATERIAL
 from appearance.scene.backend import ensure_backend
 from benchmarks.appearance.known_subjects import SmallStage, known_subject
 from benchmarks.appearance.table import GROUPS, Table
@@ -32,8 +32,6 @@ from reconstruction.light_codes.depth_range import depth_range
 from reconstruction.light_codes.search import DepthMap, DepthSearch
 from reconstruction.light_codes.segments import count_supports, to_segments
 from reconstruction.reconstruct_options import SearchOptions
-
-LADDER: tuple[Variant, ...] = ("original", "spatial", "correctives", "lights")
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,9 @@ def fit(subject: Subject, stage: SmallStage, options: InverseRenderingOptions, s
     frames = time.perf_counter() - begun
     table = Table(captured, options, seed=seed)
     begun = time.perf_counter()
-    variants = table.run(LADDER)
+    variants = table.run()
     seconds = time.perf_counter() - begun
-    last = variants[LADDER[-1]]
+    last = variants[MATERIAL[-1]]
     figures = {n: float(last[n]) for n in ("beta_m_error", "beta_n_error", "sigma_a_error")}
     figures |= {"psnr_clean": last[GROUPS[1]]["psnr_clean"], "frames_seconds": frames}
     means = np.stack([o.radiance.mean((1, 2)) for o in captured.views])

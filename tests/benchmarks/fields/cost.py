@@ -68,7 +68,7 @@ def cost(size: tuple[int, int, int], folder: Path, seed: int, progress: Progress
         "peak_gb": _peak(),
         "peak_gb_before": before,
         "predicted_gb": memory_needed([pixels] * count, many, STRANDS, request),
-        "gain": found.gain,
+        "decision": found.decision.to_dict(),
         "tried": len(found.tried),
     }
 

@@ -37,9 +37,7 @@ from reconstruction import Progress, Strands, read_strands, silent
 STAGE = SmallStage(size=24, cameras=8, lights=18, spp=576, judged_spp=576, truth=(12, 48, 48))
 CYCLES_PATHS = 96
 """Paths a pixel of Cycles' many pixels."""
-OPTIONS = InverseRenderingOptions(
-    variant="spatial", effort=Effort(pixels=300, spp=256, max_depth=10)
-)
+OPTIONS = InverseRenderingOptions(effort=Effort(pixels=300, spp=256, max_depth=10))
 
 
 def captured_of(args: argparse.Namespace) -> tuple[Captured, Strands]:
@@ -82,6 +80,7 @@ def fitted_frames(
     found = run(
         problem,
         HairMaps.of(hair),
+        stages=("shared", "spatial"),
         options=options,
         seed=seed,
         monitor=Monitor(within(progress, "inverse rendering")),
@@ -107,4 +106,4 @@ def fitted_frames(
         strands,
     )
     mean = found.maps.mean()
-    return frames, {"ended": found.ended, **mean.to_dict()}
+    return frames, {"kept": found.kept, **mean.to_dict()}

@@ -17,7 +17,6 @@ from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.anchors import Places
 from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.pictures import Pictures
-from appearance.fields.validation import GROUPS, gains, spread_of
 from appearance.metrics.scores import srgb
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import environment_map
@@ -35,6 +34,7 @@ DIRECT = 2
 light has is the same all over a small picture, so that it needs nearly as many."""
 HELD_VIEWS = (0.0, 0.5)
 """How far round the ring the cameras are that no fit sees."""
+GROUPS = ("new lights", "new views", "both new")
 MAPS = ("studio", "sky")
 MAPPED = "maps"
 Pair = tuple[AnyFloats, AnyFloats]
@@ -105,15 +105,33 @@ class Frames:
         """
         made, _ = self.errors(pictures)
         without, _ = self.errors(dict(enumerate(self.rendered)))
-        gain = gains(made.sum(axis=(0, 1)), without.sum(axis=(0, 1)))
+        gain = _decibels(made.sum(axis=(0, 1)), without.sum(axis=(0, 1)))
         found = {}
         for g, name in enumerate(GROUPS):
             # views and lights of other groups are none that could be left out
             rows, columns = (without[..., g].any(axis=k) for k in (1, 0))
-            a, b = (x[rows][:, columns, g][None, ..., None] for x in (made, without))
-            spread = spread_of(a, b, gains)
-            found[name] = {"gain": float(gain[g]), "spread": float(np.squeeze(spread))}
+            a, b = (x[rows][:, columns, g] for x in (made, without))
+            found[name] = {"gain": float(gain[g]), "spread": _spread(a, b)}
         return found
+
+
+def _decibels(squares: Array, without: Array) -> Array:
+    """Gain in dB of sums of squares over those `without`, of any one shape."""
+    ratio = np.maximum(without, 1e-30) / np.maximum(squares, 1e-30)
+    return np.asarray(10 * np.log10(np.clip(ratio, 1e-10, 1e10)))
+
+
+def _spread(squares: Array, without: Array) -> float:
+    """Standard error of the gain over `without`, both by views and lights `(V, L)`.
+
+    Jackknife variances over views and over lights add up. Infinite for one view and one light.
+    """
+    total = np.inf if max(without.shape) < 2 else 0.0
+    for others in (0, 1):
+        a, b = squares.sum(others), without.sum(others)
+        if len(a) > 1:
+            total += (len(a) - 1) * float(np.var(_decibels(a.sum() - a, b.sum() - b)))
+    return float(np.sqrt(total))
 
 
 def frames_of(subject: Subject, rig: SmallStage, seed: int) -> Frames:

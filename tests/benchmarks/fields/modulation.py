@@ -25,12 +25,12 @@ from appearance.fields.options import FieldOptions
 from appearance.fields.pictures import Pictures
 from appearance.fields.reflectance import CapturedView, ReflectanceField
 from appearance.fields.search import searched
-from appearance.fields.validation import GROUPS
 from benchmarks.appearance.known_subjects import SmallStage
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, option
 from benchmarks.fields.cost import cost
 from benchmarks.fields.fitted import captured_of, fitted_frames
 from benchmarks.fields.frames import (
+    GROUPS,
     HELD_VIEWS,
     MAPPED,
     Frames,
@@ -151,9 +151,8 @@ def row_of(frames: Frames, training: Sequence[Pictures], options: FieldOptions) 
         "cpu_seconds": seconds,
         "ridge": found.ridge,
         "clamped": found.clamped,
-        "gain": found.gain,
-        "kept": not found.doubts(),
-        "validation": found.validation,
+        "decision": found.decision.to_dict(),
+        "kept": found.decision.kept,
         "warnings": found.warnings,
     }
 

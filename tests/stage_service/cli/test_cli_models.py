@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import appearance
 from appearance import FittedModel, HairAppearance, build_scene, render_olat
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.export.groom import at_points
@@ -41,7 +42,7 @@ UNSEEN = "l12"
 INVERSE = {
     "hair_pixels": 150,
     "max_depth": DEPTH,
-    "fit": {"variant": "spatial", "shape": [1, 4, 4], "effort": {"pixels": 80, "spp": 16}},
+    "fit": {"shape": [1, 4, 4], "effort": {"pixels": 80, "spp": 16}},
 }
 
 
@@ -105,18 +106,20 @@ def error_of_render(made, capsys) -> float:
 @pytest.fixture(scope="module")
 def fitted(made):
     """What `hairstage fit` printed; the model of `made` then has maps and lights."""
-    words = ["fit", made.capture, made.model, "--method", "inverse_rendering", "--json"]
+    options = json.dumps({"inverse_rendering": INVERSE})
+    words = ["fit", made.capture, made.model, "--stages", "sun,spatial", "--options", options]
     with redirect_stdout(StringIO()) as printed:
-        assert main([str(w) for w in (*words, "--options", json.dumps(INVERSE))]) == 0
+        assert main([*map(str, words), "--json"]) == 0
     return json.loads(printed.getvalue())
 
 
 def test_a_render_of_fitted_maps_is_nearer_to_a_held_out_frame(made, fitted, capsys):
-    """Inverse rendering runs Sun's fit first, which leaves one material for all hair."""
+    """Sun's fit leaves one material for all hair."""
     found = fitted
     assert found["appearance"] == made.model.json("appearance.json")
-    assert found["error"] < found["start_error"]
-    assert len(made.model.json("lights.json")) == 12  # of 23, and four judge
+    assert [x["stage"] for x in found["stages"]] == ["shared", "spatial"]
+    assert found["inverse_rendering"]["kept"][-1] == "spatial"
+    assert len(made.model.json("lights.json")) == 16  # of 23: twelve are fitted, four decide
     mapped = error_of_render(made, capsys)
     with_maps = made.model.arrays("hair_maps.npz")
     made.model.remove("hair_maps.npz")
@@ -131,29 +134,37 @@ def run(capsys, *words) -> tuple[int, dict]:
 
 
 @pytest.mark.usefixtures("fitted")
-def test_inverse_rendering_runs_suns_fit_again_where_other_images_are_held_out(
-    made, capsys, monkeypatch
-):
-    called = []
-    for name in ("fit", "inverse_rendering", "relight", "assess"):
-        monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
-    words = (capsys, "fit", made.capture, made.model, "--method", "inverse_rendering")
-    assert run(*words)[0] == 0
-    assert called == ["inverse_rendering"]
-    assert run(*words, "--hold-out-light", "l4")[0] == 0
-    assert called[1:] == ["fit", "inverse_rendering", "relight", "assess"]
-
-
-@pytest.mark.usefixtures("fitted")
-def test_a_field_uses_the_existing_fit_unless_options_request_another(made, capsys, monkeypatch):
-    called = []
-    for name in ("fit", "fields"):
-        monkeypatch.setattr(steps, name, lambda _, name=name: called.append(name) or {})
-    words = (capsys, "fit", made.capture, made.model, "--field", "modulation")
-    assert run(*words)[0] == 0
-    assert called == ["fields"]
-    assert run(*words, "--options", '{"hair_pixels": 77}')[0] == 0
-    assert called[1:] == ["fit", "fields"]
+@pytest.mark.parametrize(
+    ("words", "called"),
+    [
+        ((), ["sun", "shared spatial correctives lights", "modulation"]),
+        (("--stages", "lights"), ["shared lights"]),
+        (("--stages", "field"), ["modulation"]),
+        (("--stages", "field", "--hold-out-light", "l4"), ["sun", "modulation"]),
+        (("--method", "sun"), ["sun"]),
+        (("--method", "inverse_rendering"), ["shared"]),
+        (
+            (*("--method", "inverse_rendering"), *("--options", '{"fit": {"variant": "spatial"}}')),
+            ["sun", "shared spatial"],
+        ),
+        (("--field", "additive"), ["additive"]),
+        (("--field", "none"), ["none"]),
+    ],
+)
+def test_the_stages_that_are_run(made, capsys, monkeypatch, words, called):
+    """Old options too; an existing sun fit is used if it held out the same."""
+    found = []
+    monkeypatch.setattr(appearance, "fit", lambda **_: found.append("sun"))
+    monkeypatch.setattr(
+        appearance, "fit_maps", lambda stages, **_: found.append(" ".join(stages)) or {}
+    )
+    monkeypatch.setattr(
+        appearance, "fit_field_validated", lambda request, **_: found.append(request.field) or {}
+    )
+    for name in ("relight", "assess"):
+        monkeypatch.setitem(steps.STEPS, name, lambda _: {})
+    assert run(capsys, "fit", made.capture, made.model, *words)[0] == 0
+    assert found == called
 
 
 def dyed_points(before: FittedModel, folder: Path) -> np.ndarray:

@@ -15,7 +15,8 @@ from stage_service.cli.support.commands import BadArgument, rig_path
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.jobs.records import JobOptions
 
-USUAL_S = dict.fromkeys(FULL.steps_s, 10.0)  # 70 s in all
+STEPS = ("reconstruct", "fit", "inverse_rendering", "relight", "assess", "evaluate", "results")
+USUAL_S = dict.fromkeys(STEPS, 10.0)  # 70 s in all
 RENDERING = {"cameras": ["cam_3", "cam_5"], "seconds": 41, "doing": "rendering camera 3 of 8"}
 
 
