@@ -33,9 +33,8 @@ LEAST_PIXELS = 1.0
 """Hair pixels of all views for each cell of the volume, below which no cell is fitted."""
 GOOD = 0.005
 """Error in displayed values that no stage is run to lower."""
-_ALTERNATIONS = 2
-"""Alternations of global parameters and cells."""
 _MORE_ROUNDS = 6
+"""Rounds of the cells after the global parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +168,11 @@ class _Fit:
         }
 
     def _shared(
-        self, raw: Raw, gain: Array, progress: Progress, names: Sequence[str] = (), number: int = 0
+        self, raw: Raw, gain: Array, progress: Progress, names: Sequence[str] = ()
     ) -> _Solved:
         """`names`, by default roughness and colour, solved for."""
         pairs = self.training.spread(self.split.fitted, SHARED_VIEWS, SHARED_LIGHTS)
-        evidence = Evidence(pairs, self.options.effort, (self.seed << 4) + number)
+        evidence = Evidence(pairs, self.options.effort, self.seed << 4)
         raw, of_lights, left_open = solve_global_parameters(
             self.training, raw, gain[self.lights], names or self.colour, evidence, progress
         )
@@ -183,11 +182,8 @@ class _Fit:
 
     def _spatial(self, raw: Raw, gain: Array, progress: Progress) -> _Solved:
         raw = self._cells(self._in_cells(raw), gain, 0)
-        left_open: dict[str, float] = {}
-        for k in range(_ALTERNATIONS):
-            raw, gain, left_open = self._shared(raw, gain, progress, number=k)
-            raw = self._cells(raw, gain, 1 + k)
-        return raw, gain, left_open
+        raw, gain, left_open = self._shared(raw, gain, progress)
+        return self._cells(raw, gain, 1), gain, left_open
 
     def _cells(self, raw: Raw, gain: Array, number: int) -> Raw:
         more = {"rounds": _MORE_ROUNDS, "whole": 0} if number else {}

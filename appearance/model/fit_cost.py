@@ -64,7 +64,7 @@ def estimate_fit(
     paths = {
         "sun": _PATHS["sun"],
         "shared": shared,
-        "spatial": _PATHS["spatial"] + 2 * shared,
+        "spatial": _PATHS["spatial"] + shared,
         "correctives": _PATHS["correctives"] + judged,
         "lights": shared,
         "field": _PATHS["field"] * sum(of_field) * field.spp * many / _PROBE_LIGHTS,

@@ -36,9 +36,13 @@ class DemoKind:
 
 FULL = DemoKind(
     "full",
-    {"assess": {"turning_frames": 36}},
+    {
+        "stages": ["sun", "shared", "spatial", "lights", "field"],
+        "fields": {"lights": 12, "pixels": 1500, "spp": 16},
+        "assess": {"turning_frames": 36},
+    },
     720.0,
-    {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"},
+    {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"} | {"fields": 25.0},
 )
 LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 80, 24, 24
 _SIZE = f"{LIGHTS} lights, {PIXELS} × {PIXELS} pixels"

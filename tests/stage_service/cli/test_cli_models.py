@@ -167,6 +167,18 @@ def test_the_stages_that_are_run(made, capsys, monkeypatch, words, called):
     assert found == called
 
 
+@pytest.mark.usefixtures("fitted")
+def test_an_estimate_lists_the_stages_that_would_run_and_writes_nothing(made, capsys):
+    before = {name: path.stat().st_mtime for name, path in made.model.artifacts().items()}
+    words = ("fit", made.capture, made.model, "--stages", "spatial", "--estimate")
+    code, data = run(capsys, *words)
+    assert code == 0
+    assert [x["name"] for x in data["stages"]] == ["shared", "spatial"]
+    assert data["seconds"] == pytest.approx(sum(x["seconds"] for x in data["stages"]))
+    after = {name: path.stat().st_mtime for name, path in made.model.artifacts().items()}
+    assert after == before
+
+
 def dyed_points(before: FittedModel, folder: Path) -> np.ndarray:
     """Which points `(S, n)` of the same strands have another colour in the model `folder`."""
     looks = [
