@@ -21,7 +21,7 @@ from reconstruction import Capture, Model
 from reconstruction.report.report import resident_memory
 
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
-_PATHS = {"sun": 3.0e6, "shared": 30.0, "spatial": 4.0e6, "correctives": 3.0e6, "field": 1.5}
+_PATHS = {"sun": 2.7e6, "shared": 87.0, "spatial": 6e5, "correctives": 1.1e6, "field": 1.5}
 """Paths of the stages, in paths of the probe: of sun, spatial and correctives in all; of shared for
 each of a patch's; of field for each that it renders."""
 _JUDGED = 1 << 20
@@ -58,7 +58,7 @@ def estimate_fit(
     pixels = [min(n, request.hair_pixels) for n in hair]
     fitted = min(lights, request.lights + request.validation_lights)
     views = min(SHARED_VIEWS, len(pixels)) * min(SHARED_LIGHTS, fitted)
-    judged = 2 * min(_JUDGED, 16 * effort.spp * sum(pixels))
+    judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
     shared = _PATHS["shared"] * views * effort.pixels * effort.spp / SHARED_LIGHTS + judged
     of_field, many = [min(n, field.pixels) for n in hair], min(lights, field.lights)
     paths = {

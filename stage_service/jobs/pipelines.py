@@ -24,7 +24,7 @@ The result comes first; comparisons and compression delay nobody."""
 SECONDS = {
     "reconstruct": 166,
     "fit": 63,
-    "inverse_rendering": 110,
+    "inverse_rendering": 85,
     "fields": 120,
     "relight": 80,
     "assess": 60,
