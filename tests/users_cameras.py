@@ -24,7 +24,7 @@ def by_opencv(lenses: dict[str, Lens]) -> Pixels:
     def pixels(points: np.ndarray) -> dict[str, np.ndarray]:
         out = {}
         for name, (K, R, t, distortion) in lenses.items():
-            there, _ = cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, K, distortion)
+            there, _ = cv2.projectPoints(np.array(points), cv2.Rodrigues(R)[0], t, K, distortion)
             out[name] = there[:, 0]
         return out
 
