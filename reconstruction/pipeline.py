@@ -68,8 +68,9 @@ def reconstruct(
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
     expected = STAGES[method_for(capture) if method == "auto" else method]
     report = ReportWithProgress(progress, expected)
+    model.create()
     with cached_frames(capture, model.path) as kept:
-        model.create().start(capture.world if options.frame == "user" else None)
+        model.start(capture.world if options.frame == "user" else None)
         run = _Run(Stages(model, options, report.progress, report), kept)
         run.reconstruct(method, motion)
     if not any(stage.name == "head" for stage in report.stages):

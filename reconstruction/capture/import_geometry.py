@@ -123,7 +123,7 @@ def read_geometry(files: GeometryFiles) -> Geometry:
     lights: list[Light] = []
     if files.lights is not None:
         found = read_lights(files.lights)
-        lights, more = _lights(files, found, cameras)
+        lights, more = place_lights(files, found, cameras)
         notes += found.notes + more
     return Geometry({c.name: c for c in cameras}, lights, notes, files.placement)
 
@@ -142,9 +142,10 @@ def _two_units(path: Path | None, stated: float, option: str, given: Unit) -> st
     return f"{path}: states a unit of {stated:g} m, {option} is {metres(given):g} m, which is used"
 
 
-def _lights(
+def place_lights(
     files: GeometryFiles, found: LightFile, cameras: list[Camera]
 ) -> tuple[list[Light], list[str]]:
+    """The lights `found` in a file, placed, and notes. Raises `PlacementError`."""
     where, lights, directions = files.placement, found.lights, found.directions
     notes: list[str] = []
     if found.metres is not None:

@@ -8,10 +8,15 @@ from typing import Any
 import numpy as np
 
 from reconstruction.arrays import Array
-from reconstruction.capture.import_geometry import Geometry, checked
+from reconstruction.capture.import_geometry import (
+    Geometry,
+    GeometryFiles,
+    checked,
+    place_lights,
+)
 from reconstruction.capture.import_settings import ImportProblem
 from reconstruction.containment import is_file_name
-from reconstruction.files.lights import lobe
+from reconstruction.files.lights import lobe, read_lights
 from reconstruction.files.points import read_points
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
@@ -150,8 +155,10 @@ def lights_of(path: Path, cameras: dict[str | int, str], length: Unit = "m") -> 
     return out
 
 
-def own_geometry(folder: Path, placement: PlacementOptions) -> Geometry:
-    """The folder's cameras.json and lights.json, placed.
+def own_geometry(
+    folder: Path, placement: PlacementOptions, files: GeometryFiles | None = None
+) -> Geometry:
+    """The folder's cameras.json, and its lights.json or the lights of `files`, placed.
 
     Without a placement they are in metres with z up, and doubts are notes. Raises `ImportProblem`
     naming the file.
@@ -159,17 +166,26 @@ def own_geometry(folder: Path, placement: PlacementOptions) -> Geometry:
     path, default = folder / "cameras.json", placement == PlacementOptions()
     read = cameras_of(path)
     names = {id_: c.name for id_, c in read.items()}
-    lights = lights_of(folder / "lights.json", names, placement.light_unit or placement.unit)
+    cameras = list(read.values())
     if not default:
-        cameras = placed(list(read.values()), placement, "opencv")
-        read, lights = dict(zip(read, cameras, strict=True)), placed_lights(lights, placement)
+        cameras = placed(cameras, placement, "opencv")
+        read = dict(zip(read, cameras, strict=True))
+    more: list[str] = []
+    if files is not None and files.lights is not None:
+        found = read_lights(files.lights)
+        lights, more = place_lights(files, found, cameras)
+        more = [*found.notes, *more]
+    else:
+        lights = lights_of(folder / "lights.json", names, placement.light_unit or placement.unit)
+        lights = lights if default else placed_lights(lights, placement)
     try:
         notes = checked(path, list(read.values()), placement, "opencv")
     except PlacementError as error:
         if not default:
             raise ImportProblem(str(error)) from error
-        return Geometry(read, lights, [] if str(error).endswith(PARALLEL) else [str(error)])
-    return Geometry(read, lights, [] if default else notes, placement)
+        doubts = [] if str(error).endswith(PARALLEL) else [str(error)]
+        return Geometry(read, lights, [*doubts, *more])
+    return Geometry(read, lights, [*([] if default else notes), *more], placement)
 
 
 def projectors_of(path: Path) -> tuple[Projector, ...]:

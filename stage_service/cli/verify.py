@@ -161,10 +161,10 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
     if files.light_distance is not None and files.lights is None:
         raise BadArgument("--light-distance needs --lights; lights.json has positions")
-    if files.cameras or files.lights:
+    if files.cameras or (files.lights and not (args.folder / "cameras.json").is_file()):
         geometry = read_geometry(files)
     else:
-        geometry = own_geometry(args.folder, files.placement)
+        geometry = own_geometry(args.folder, files.placement, files)
     if args.pictures is not None:
         patterns = replace(settings.pictures, olat=args.pictures)
         settings = replace(settings, pictures=patterns)

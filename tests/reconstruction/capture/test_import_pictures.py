@@ -670,3 +670,19 @@ def test_steps_of_all_kinds(beamed, tmp_path):
         ("tracking", None), ("scanline", 2), ("scanline", 3), ("tracking", None),
     ]  # fmt: skip
     assert capture.of_kind("scanline")[0].projector == "proj_0"
+
+
+def test_lights_of_a_file_beside_cameras_json(folder: Path, tmp_path: Path) -> None:
+    """By --lights: LEDs in millimetres with axes, instead of lights.json."""
+    everywhere(lambda c, n, x: save(folder / f"images/{c}/{n:03d}.png", x, np.uint16))
+    cameras = json.loads((folder / "cameras.json").read_text())["cameras"]
+    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras[:1]}))
+    rows = [f"{i},0,{100 * i},-1000,0,0,1" for i in range(len(LIGHTS))]
+    table = folder / "leds.csv"
+    table.write_text("\n".join(["id,x_mm,y_mm,z_mm,aim_x,aim_y,aim_z", *rows]) + "\n")
+    arguments = ["--lights", str(table), "--out", str(tmp_path / "out")]
+    assert main(["import", str(folder), *arguments]) == 0
+    light = Capture(tmp_path / "out").rig.lights[2]
+    np.testing.assert_allclose(light.position, [0, 0.2, -1])
+    aside = light.intensity_towards([1, 0.2, 0])  # at 45 degrees
+    np.testing.assert_allclose(aside / light.intensity, np.sqrt(0.5), rtol=1e-4)
