@@ -68,10 +68,9 @@ if __name__ == "__main__":
     steps.STEPS.update(
         reconstruct=first, evaluate=slow, results=last, fit=bad, relight=last, assess=last
     )
-    steps.STEPS.update(inverse_rendering=last, fields=last)
+    steps.STEPS.update(inverse_rendering=last, fields=last)  # also of a light worker
     if "light" in sys.argv:
         steps.STEPS.update(
             reconstruct=light, evaluate=light, fit=light, relight=light, assess=light
         )
-        steps.STEPS.update(inverse_rendering=light, fields=light)
     run_worker(Path(sys.argv[1]), gpu="gpu" in sys.argv, ready=lambda name: print(name, flush=True))
