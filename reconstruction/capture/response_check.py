@@ -95,11 +95,11 @@ def check_response(frames: ImportedFrames, replaceable: bool) -> ResponseCheck:
 
 def _contradicts(sums: SummedLights, fit: CurveFit, stated: Curve, black: float) -> bool:
     """Whether the stated curve's light differs by `WRONG` over the values, and explains less."""
-    told = replace(fit, curve=stated, black=black)
+    as_stated = replace(fit, curve=stated, black=black)
     v = np.quantile(sums.singles[sums.singles > fit.black + 5 * sums.noise], np.linspace(0.1, 0.9))
     ratio = sums.light(v, stated, black) / sums.light(v, fit.curve, fit.black)
     spread = float(np.log(np.maximum(ratio, 1e-6)).max() - np.log(np.maximum(ratio, 1e-6)).min())
-    return spread > WRONG and advantage(sums, fit, told) > 3
+    return spread > WRONG and advantage(sums, fit, as_stated) > 3
 
 
 @dataclass(eq=False)
