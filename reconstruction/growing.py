@@ -79,8 +79,8 @@ class GrowingStages(Stages):
     ) -> Grown:
         """Strands from the scalp, then through the gaps between them, all rooted.
 
-        `measured` polylines `(N, 3)` and those through gaps are rooted alike. If fewer of them
-        reach the scalp than do not, as where cameras show the end of a tail, none has a root.
+        `measured` polylines `(N, 3)` and those through gaps are rooted alike. None has a root where
+        cameras show the scalp of too few (`Rooted.reaches`), as of the end of a tail.
         `within` in metres: see `fill_gaps`.
         """
         o = self.options
@@ -101,7 +101,7 @@ class GrowingStages(Stages):
             self.progress("rooting strands", 0.7)
             loose = [polyline.astype(np.float32) for polyline in measured] + gaps
             result = root_all(rooted, loose, scalp)
-            reached = result.dropped <= len(result.strands)
+            reached = result.reaches
             paths = result.strands if reached else roots_first([*rooted, *loose], None)
             if not paths:
                 raise CaptureError(
@@ -122,11 +122,12 @@ class GrowingStages(Stages):
                 metres=float(strands.lengths().sum()),
                 options=asdict(o),
             )
-            if result.dropped:
+            if result.dropped or not reached:
+                away = result.dropped if reached else result.dropped + result.joined
                 consequence = "and were removed" if reached else "so that no strand is rooted"
                 stage.warn(
-                    f"{result.dropped} of {len(rooted) + len(loose)} strands could not be "
-                    f"connected to the scalp, {consequence}"
+                    f"{away} of {len(rooted) + len(loose)} strands could not be connected to the "
+                    f"scalp, {consequence}"
                 )
         return Grown(strands, reached)
 

@@ -28,6 +28,11 @@ _LEAST_COSINE = np.cos(np.radians(45.0))
 """Of the angle between a loose strand and the neighbour that continues it."""
 
 
+_LED = 10
+"""Strands that may join one that reaches the scalp, on average. Their connections are copies of its
+path: beyond that number most of a patch's strands are copies, and its few roots are chance."""
+
+
 @dataclass(frozen=True)
 class Rooted:
     """Rooted strands, and how many loose ones were connected `to_scalp`, `joined` a rooted
@@ -37,6 +42,12 @@ class Rooted:
     to_scalp: int
     joined: int
     dropped: int
+
+    @property
+    def reaches(self) -> bool:
+        """Whether the strands reach the scalp: most of them, and enough without a neighbour."""
+        itself = len(self.strands) - self.joined
+        return self.dropped <= len(self.strands) and self.joined <= _LED * itself
 
 
 def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:

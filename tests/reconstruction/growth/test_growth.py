@@ -206,3 +206,12 @@ def test_hair_shorter_than_the_shortest_that_is_kept_elsewhere_grows() -> None:
 def test_where_nothing_has_an_orientation_nothing_is_covered() -> None:
     field = dataclasses.replace(analytic(up, (3, 3, 3)), degenerate=np.ones(27, bool))
     assert Coverage(field).share() == 0
+
+
+@pytest.mark.parametrize(("loose", "reaches"), [(9, True), (12, False)])
+def test_copies_of_one_way_to_the_scalp_do_not_root_a_patch(loose: int, reaches: bool) -> None:
+    """Of 30,561 strands of a patch of curls 443 reached the scalp, and the others copied them."""
+    rooted = [line((0, 0, 0), (0, 0, 0.05))]
+    x = np.linspace(-2e-3, 2e-3, loose)
+    result = root_all(rooted, [line((a, 0, 0.05), (a, 0, 0.1)) for a in x], flat_scalp())
+    assert (result.joined, result.dropped, result.reaches) == (loose, 0, reaches)
