@@ -37,7 +37,8 @@ class Terminated(BaseException):
 def terminable() -> Iterator[None]:
     """Raise `Terminated` at SIGTERM in the with-block, so that every `finally` runs.
 
-    SIGHUP, a terminal that is closed, counts as SIGTERM unless it is ignored (nohup).
+    SIGHUP, a terminal that is closed, counts as SIGTERM unless it is ignored (nohup). A stop that
+    another exception wraps, as in Dr.Jit's loops, is raised itself.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -52,6 +53,13 @@ def terminable() -> Iterator[None]:
             if handler is signal.SIG_DFL:
                 signal.signal(number, end)
         yield
+    except Exception as error:
+        cause = error.__cause__
+        while isinstance(cause, Exception):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise cause from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -28,7 +28,7 @@ _LEAST_COSINE = np.cos(np.radians(45.0))
 """Of the angle between a loose strand and the neighbour that continues it."""
 
 
-_LED = 10
+_LED = 20
 """Strands that may join one that reaches the scalp, on average. Their connections are copies of its
 path: beyond that number most of a patch's strands are copies, and its few roots are chance."""
 

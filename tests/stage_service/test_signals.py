@@ -1,33 +1,28 @@
-"""A signal ends the wait whenever it comes; others do not."""
+"""Signals that come inside Dr.Jit's loops."""
 
-from __future__ import annotations
+import os
+import signal
 
-import subprocess
-import sys
+import pytest
 
-WAITS = """
-import signal, threading
-from stage_service.signals import taken
-signal.signal(signal.SIGUSR1, lambda *_: None)
-wait = taken(signal.SIGTERM, signal.SIGINT)
-signal.raise_signal(signal.SIGUSR1)
-{before}
-wait()
-print("over")
-"""
+from appearance.scene.backend import ensure_backend
+from stage_service.signals import Terminated, terminable
 
 
-def run(before: str) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-c", WAITS.format(before=before)]
-    return subprocess.run(words, capture_output=True, text=True, timeout=20)
+def test_a_stop_inside_a_loop_of_drjit_is_a_stop() -> None:
+    """Dr.Jit wraps what is raised in a loop: the command called it a fault of hairstage."""
+    ensure_backend()
+    import drjit as dr
+    import mitsuba as mi
+
+    def body(i: object) -> tuple[object]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return (i + 1,)  # type: ignore[operator]
+
+    with pytest.raises(Terminated), terminable():
+        dr.while_loop((dr.zeros(mi.UInt32, 4),), lambda i: i < 3, body)
 
 
-def test_a_signal_that_comes_before_the_wait_is_not_slept_through():
-    done = run("signal.raise_signal(signal.SIGTERM)")
-    assert (done.returncode, done.stdout) == (0, "over\n"), done.stderr
-
-
-def test_a_signal_amid_the_wait_ends_it_and_another_does_not():
-    later = "threading.Timer(0.2, lambda: signal.raise_signal(signal.SIGINT)).start()"
-    done = run(later)
-    assert (done.returncode, done.stdout) == (0, "over\n"), done.stderr
+def test_a_fault_with_a_cause_stays_itself() -> None:
+    with pytest.raises(RuntimeError, match="outer"), terminable():
+        raise RuntimeError("outer") from ValueError("inner")
