@@ -82,7 +82,7 @@ def _row(
 ) -> str:
     text = f"{title:<42}{ours:6.1f} {unit:<2}"
     if not others:
-        return f"{text}  none"
+        return f"{text}  not computed"
     best = max(others, key=lambda name: others[name])
     return f"{text}  {others[best]:.1f} {unit}, {names[best]}"
 
