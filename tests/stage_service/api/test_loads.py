@@ -29,6 +29,7 @@ from stage_service.captures.catalogue import Catalogue
 from stage_service.devices.lights.modbus import ModbusLightBank
 from stage_service.jobs.slots import WorkerSlot
 from stage_service.records.tokens import Tokens
+from stage_service.service_models import CaptureRequest
 
 THREADS = 45
 """More than may be at work at once, and more than the 40 that the framework has."""
@@ -88,9 +89,11 @@ def test_while_every_request_that_may_be_at_work_waits(rig_file, world, tmp_path
         serving(rig_file, tmp_path) as http,
         stuck(monkeypatch, http.service, "validate") as waiting,
     ):
-        capture = begun(http, world)
         flood(http, "POST", "/plans:validate", json={})
         until(lambda: waiting() == LIMITS["requests"].steering)
+        request = CaptureRequest.model_validate(LONG)
+        capture = http.service.start_capture(request, control.Caller("here")).id
+        until(lambda: world.pulses > 3)
         assert_it_can_be_darkened(http, world, capture)
 
 
