@@ -82,8 +82,8 @@ def run(
     """Fit from `maps` and the lights' factors `gain (L,)`, 1 where None.
 
     `held_lights` lights, by default a quarter and at most four, and one view of four or more are
-    held out. A stage starts from the last
-    that was kept, and is kept if `decide` finds the error of the held-out frames lower.
+    held out. A stage starts from the last that was kept, and is kept if `decide` finds the error of
+    the held-out frames lower.
     """
     gain = np.ones(len(problem.lights)) if gain is None else gain
     if held_lights is None:
@@ -215,4 +215,4 @@ class _Fit:
 
 _Solved = tuple[Raw, Array, dict[str, float]]
 _Solver = Callable[[Raw, Array, Progress], _Solved]
-"""From unknowns and factors on the lights' intensities to new ones, and what was left open."""
+"""Solves a stage: fitted unknowns, factors on the lights' intensities, and `Solved.left_open`."""

@@ -131,7 +131,7 @@ def fit_lights(sums: SummedLights) -> tuple[CurveFit, Array, Array] | None:
         worst = int(np.nanargmax(np.where(wrong, 0, beyond)))
         if beyond[worst] <= 1 or wrong.sum() == MOST_WRONG:
             return fit, np.where(wrong | np.isnan(level), level, 1.0), error
-        wrong[worst] = True  # one at a time: a wrong level bends the curve, and that the others
+        wrong[worst] = True  # one at a time: a wrong level bends the curve, which alters the others
         factor = np.where(wrong, np.maximum(level, 1e-3), 1.0)
 
 
@@ -147,8 +147,9 @@ def _fit_curve(sums: SummedLights) -> CurveFit | None:
     clear = advantage(sums, power, srgb)
     if clear < -2 or (clear < 2 and abs(srgb.black) < abs(power.black)):
         return srgb
-    gamma = float(power.curve)  # type: ignore[arg-type]
-    return replace(power, curve="linear") if abs(gamma - 1) < max(0.04, 2 * power.error) else power
+    assert isinstance(power.curve, float)  # fitted as a power
+    straight = abs(power.curve - 1) < max(0.04, 2 * power.error)
+    return replace(power, curve="linear") if straight else power
 
 
 def fit_black(sums: SummedLights, curve: Curve) -> CurveFit:

@@ -1,4 +1,4 @@
-"""Folders laid out as public sets are: imported, with cameras, lights and pixels as the files say.
+"""Folders in the layouts of public sets import with the right cameras, lights and pixels.
 
 Each picture has its frame's number and its camera in black and white cells, whatever the curve.
 The layouts are those of the authors' own tools: FaceOLAT's README and relighting/, HumanOLAT's

@@ -299,8 +299,8 @@ def openillumination(folder: Path, shoot: Shoot) -> None:
 
 @dataclass(frozen=True)
 class Walk:
-    """A folder; `shown` of the pages' command to import; options `named` by its errors; `measured`
-    (or the set) is known to the user, as the page says; `fitted` by the tutorial's step 5."""
+    """A folder: the documented command `shown` imports it, with the options that its errors `named`
+    and those that the user has `measured`; if `fitted`, step 5 of the tutorial follows."""
 
     write: Callable[[Path, Shoot], None]
     pixels: Callable[[Path], readers.Pixels]

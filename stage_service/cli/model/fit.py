@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
     fit.add_argument(
         "--stages",
-        type=lambda text: text.split(","),
+        type=_stage_names,
         help="only some of sun, shared, spatial, correctives, lights, field, separated by commas; "
         "default: all",
     )
@@ -50,6 +50,18 @@ def add(commands: Commands) -> None:
         "an .hdr or .exr file",
     )
     fit.add_argument("--seed", type=int, default=0)
+
+
+def _stage_names(text: str) -> list[str]:
+    from appearance.metrics.decision import STAGES
+
+    names = text.split(",")
+    for name in names:
+        if name not in STAGES:
+            raise argparse.ArgumentTypeError(
+                f"{name!r} is no stage: name some of {','.join(STAGES)}"
+            )
+    return names
 
 
 def run(args: argparse.Namespace, output: Output) -> None:

@@ -167,6 +167,12 @@ def test_the_stages_that_are_run(made, capsys, monkeypatch, words, called):
     assert found == called
 
 
+def test_a_stage_that_there_is_not_is_named_with_those_there_are(made, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", str(made.capture), str(made.model), "--stages", "sun,shard"])
+    assert "'shard' is no stage: name some of sun,shared,spatial" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("fitted")
 def test_an_estimate_lists_the_stages_that_would_run_and_writes_nothing(made, capsys):
     before = {name: path.stat().st_mtime for name, path in made.model.artifacts().items()}
