@@ -316,7 +316,7 @@ RIG = (
     """
 name = "callers"
 [dome]
-lights = 100
+lights = 331
 radius = 1.2
 intensity = [8.0, 8.0, 8.0]
 """
