@@ -5,6 +5,7 @@ Files are written durably: after a crash each is the old one or the new one.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -130,11 +131,7 @@ class Model:
     def artifacts(self) -> dict[str, Path]:
         """The complete files by their names relative to the folder, in order."""
         root = self.path.resolve()
-        return {
-            p.relative_to(root).as_posix(): p
-            for p in sorted(root.rglob("*"))
-            if p.is_file() and not p.name.startswith(PART) and p.resolve().is_relative_to(root)
-        }
+        return {p.relative_to(root).as_posix(): p for p in sorted(_complete_files(root, root))}
 
     def sizes(self) -> dict[str, int]:
         """Bytes of `artifacts` by their names, without those that a job removes meanwhile."""
@@ -284,3 +281,16 @@ class Model:
         if not path.exists():
             raise ModelError(f"{path} is missing: run '{command} {self.path}' first")
         return path
+
+
+def _complete_files(folder: Path, root: Path) -> Iterator[Path]:
+    """The files below a folder that are written to their end; links only if they stay in `root`."""
+    with suppress(FileNotFoundError), os.scandir(folder) as entries:
+        for entry in entries:
+            path = Path(entry.path)
+            if entry.is_dir(follow_symlinks=False):
+                yield from _complete_files(path, root)
+            elif entry.name.startswith(PART) or not entry.is_file():
+                continue
+            elif not entry.is_symlink() or path.resolve().is_relative_to(root):
+                yield path

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from reconstruction.reading import printable
@@ -29,14 +30,25 @@ def outward(folder: Path) -> list[str]:
     """The first links below `folder` that lead out of it, or nowhere, as "name -> target". Linked
     folders are not entered."""
     root, found = folder.resolve(), []
-    for place, folders, files in os.walk(folder):
-        for name in sorted([*folders, *files]):
-            path = Path(place) / name
-            if path.is_symlink() and not _inside(path, root):
-                found.append(f"{printable(str(path.relative_to(folder)))} -> {target_of(path)}")
-                if len(found) == MOST_NAMED:
-                    return found
+    for path in _links(folder):
+        if not _inside(path, root):
+            found.append(f"{printable(str(path.relative_to(folder)))} -> {target_of(path)}")
+            if len(found) == MOST_NAMED:
+                break
     return found
+
+
+def _links(folder: Path) -> Iterator[Path]:
+    """The links below a folder: in it by name, then in the folders in it."""
+    try:
+        with os.scandir(folder) as found:
+            entries = sorted(found, key=lambda entry: entry.name)
+    except OSError:
+        return
+    yield from (Path(entry.path) for entry in entries if entry.is_symlink())
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _links(Path(entry.path))
 
 
 def check_link(what: str, path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from pathlib import Path as FolderPath
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -28,6 +30,10 @@ OBJ = {"requestBody": {"required": True, "content": {"model/obj": {}}}}
 PNG = {"requestBody": {"required": True, "content": {"image/png": {}}}}
 
 
+_LISTING = threading.Lock()
+"""A capture's files take 0.3 s to list; a dozen lists at once would delay all other requests."""
+
+
 @router.delete("/captures/{capture}")
 async def remove_capture(
     capture: str, service: OnService, lanes: OnLanes, by: Steers, dry_run: DryRun = False
@@ -39,7 +45,7 @@ async def remove_capture(
 @reading.get("/captures/{capture}/archive.tar", response_class=Response, responses=TAR)
 def get_capture_archive(capture: str, service: OnService) -> Response:
     """All files of a finished capture as a tar file, with ranges to resume."""
-    return tar_response(capture, files_of(f"the capture {capture}", service.done_capture(capture)))
+    return _archive("capture", capture, service.done_capture(capture))
 
 
 @reading.get("/models")
@@ -59,7 +65,7 @@ async def remove_model(
 @reading.get("/models/{model}/archive.tar", response_class=Response, responses=TAR)
 def get_model_archive(model: str, service: OnService) -> Response:
     """All complete files of a model as a tar file."""
-    return tar_response(model, files_of(f"the model {model}", service.storage.model(model).path))
+    return _archive("model", model, service.storage.model(model).path)
 
 
 @reading.get("/trash")
@@ -111,3 +117,8 @@ async def upload_mask(
 def remove_upload(subject: Subject, service: OnService, by: Steers) -> Folder:
     """Delete a subject's uploads; captures keep their copies."""
     return service.storage.remove_upload(subject, by)
+
+
+def _archive(kind: str, name: str, folder: FolderPath) -> Response:
+    with _LISTING:
+        return tar_response(name, files_of(f"the {kind} {name}", folder))
