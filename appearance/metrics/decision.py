@@ -64,12 +64,17 @@ def decide(
 ) -> Decision:
     """The decision by sums of squared errors before and after a stage, and their counts `(V, B)`.
 
-    V are views and B parts of the hair, none of them fitted. The standard error of the difference
-    of root mean squares is from jackknife variances over views and over parts, which add up.
+    V are views and B parts of the hair, none of them fitted. Sums are products of two independent
+    renderings' errors: unbiased, and negative where noise exceeds the error. The estimator is the
+    fall of the mean square, linear in the sums, with jackknife variances over views and over parts,
+    which add up: noise of single parts of a view counts twice, so that the standard error is too
+    large rather than too small. Both are divided by the sum of the root mean squares, by which they
+    are the fall of the root mean square and its standard error; `after` is below 0 where its sum
+    is. Nothing is kept by one part of one view, or if the sum `before` is not positive.
     """
 
-    def change(a: AnyFloats, b: AnyFloats, n: AnyFloats) -> Array:
-        return _rms(a, n) - _rms(b, n)
+    def fall(a: AnyFloats, b: AnyFloats, n: AnyFloats) -> Array:
+        return (np.asarray(a) - b) / np.maximum(n, 1)
 
     variance, known = 0.0, False
     for axis in (0, 1):
@@ -77,10 +82,11 @@ def decide(
         k = int((parts[2] > 0).sum())
         if k > 1:
             left = [(x.sum() - x)[parts[2] > 0] for x in parts]
-            variance, known = variance + (k - 1) * float(np.var(change(*left))), True
-    was, now = (float(_rms(x.sum(), counts.sum())) for x in (before, after))
-    return Decision(stage, was, now, variance**0.5 if known else None, seconds=seconds)
-
-
-def _rms(squares: AnyFloats, counts: AnyFloats) -> Array:
-    return np.sqrt(np.maximum(squares, 0) / np.maximum(counts, 1))
+            variance, known = variance + (k - 1) * float(np.var(fall(*left))), True
+    total = [np.asarray(x.sum()) for x in (before, after, counts)]
+    was, now = (float(np.sqrt(np.maximum(x, 0) / np.maximum(total[2], 1))) for x in total[:2])
+    if not was > 0:
+        return Decision(stage, was, was, None, seconds=seconds)
+    error = variance**0.5 / (was + now) if known else None
+    now = was - float(fall(*total)) / (was + now)
+    return Decision(stage, was, now, error, seconds=seconds)

@@ -42,6 +42,42 @@ def test_nothing_is_kept_without_a_standard_error_or_by_what_is_not_a_number():
     assert not decide("field", 0 * many, 0 * many, 0 * many).kept
 
 
+def test_the_estimate_is_linear_in_the_sums_by_hand():
+    """Two views of one part, one pixel each: squares fall by 0.8 and 0.6, their mean by 0.7, with
+    a standard error of 0.1; the sum after is that of noise, below 0."""
+    before, after = np.array([[0.7], [0.74]]), np.array([[-0.1], [0.14]])
+    found = decide("field", before, after, np.ones((2, 1)))
+    was, now = 0.72**0.5, 0.02**0.5
+    assert (found.before, found.after) == (pytest.approx(was), pytest.approx(now))
+    assert found.standard_error == pytest.approx(0.1 / (was + now))
+    negative = decide("field", before, after - 0.04, np.ones((2, 1)))
+    assert negative.after == pytest.approx(-0.02 / was)
+    assert negative.before - negative.after == pytest.approx(0.74 / was)
+    assert negative.kept
+
+
+@pytest.mark.parametrize("error", [0.1, 0.01, 0.0])
+def test_what_changes_nothing_is_seldom_kept_at_any_error(error):
+    """One standard error keeps 16 % where errors are of views or parts, fewer where they are of
+    noise, also if the errors themselves vanish in it."""
+    rng, counts = np.random.default_rng(0), np.full((8, 9), 100.0)
+    draws = counts * (error**2 + 1e-3 * rng.normal(size=(1000, 2, 8, 9)))
+    kept = np.mean([decide("field", a, b, counts).kept for a, b in draws])
+    assert 0.02 < kept < 0.16
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (8, 1)])
+def test_one_view_or_one_part_has_the_spread_of_the_other_axis(shape):
+    rng, counts = np.random.default_rng(0), np.full(shape, 100.0)
+    fall = 0.2 * (1 + 0.1 * rng.normal(size=shape))
+    found = decide("field", counts, counts * (1 - fall), counts)
+    scale = found.before + found.after
+    expected = np.std(fall, ddof=1) / fall.size**0.5 / scale
+    assert found.standard_error == pytest.approx(expected)
+    assert found.kept
+    assert not decide("field", counts, counts, counts).kept  # 0 is not more than 0
+
+
 def test_views_and_parts_without_frames_do_not_count():
     rng = np.random.default_rng(0)
     before, after = rng.uniform(1, 2, (2, 4, 9))
