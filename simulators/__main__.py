@@ -23,7 +23,7 @@ from simulators.peers.faults import Faults
 from simulators.peers.lamps import Lamps
 from simulators.subject.drift import Drift
 from simulators.subject.props import Prop, PropResponder, named_prop
-from simulators.subject.subject import Subject, check_fits, load_subject
+from simulators.subject.subject import NAMES, Subject, check_fits, load_subject
 from simulators.subject.truth import EXPOSURES, write_truth
 from simulators.world import World
 from stage_service.config import RigFile, load_rig_file
@@ -123,8 +123,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--subject",
         default="wavy",
-        help="wavy, straight, curly, or a strand file; to calibrate: board:N, mirror:N or "
-        "diffuse:N in pose or place N (default: wavy)",
+        help=f"{', '.join(NAMES)}, or a strand file; to calibrate: board:N, mirror:N or diffuse:N "
+        "in pose or place N (default: wavy)",
     )
     parser.add_argument("--head", type=Path, help="OBJ of the head under the strand file's hair")
     parser.add_argument("--state", type=Path, help="folder for devices.toml and the serial ports")

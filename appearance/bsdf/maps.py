@@ -51,6 +51,11 @@ class HairMaps:
         sigma_a, rotation = np.broadcast_to(hair.sigma_a, (*shape, 3)), np.zeros((*shape, 2))
         return cls(sigma_a, rotation, hair.beta_m, hair.beta_n, hair.eta, hair.tilt_deg)
 
+    @classmethod
+    def each(cls, hair: HairAppearance, absorption: Array) -> HairMaps:
+        """`hair` with `absorption (n_c, S, 3)` of every strand, for `MappedStrands.alone`."""
+        return replace(cls.of(hair, (1, len(absorption[0]), 1)), sigma_a=absorption[:, :, None])
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """(n_c, w, h) of the absorption."""
@@ -125,6 +130,12 @@ class MappedStrands:
             root_normals(strands),
         )
         return cls(scene, np.asarray(root_uv, float), coordinates)
+
+    @classmethod
+    def alone(cls, scene: HairScene, strands: Strands) -> MappedStrands:
+        """Each strand in a cell of its own, of maps with S columns and one row."""
+        u = (np.arange(len(strands)) + 0.5) / max(len(strands), 1)
+        return cls.of(scene, strands, np.stack([u, np.full(len(u), 0.5)], axis=-1))
 
     def with_maps(self, maps: HairMaps) -> HairScene:
         """The scene with the maps on its hair; geometry is shared."""

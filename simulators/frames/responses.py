@@ -160,9 +160,13 @@ class MitsubaResponder:
     @cached_property
     def _scene(self) -> HairScene:
         from appearance import build_scene
+        from appearance.bsdf.maps import HairMaps, MappedStrands
 
         s = self._subject
-        return build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
+        scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
+        if s.absorption is None:
+            return scene
+        return MappedStrands.alone(scene, s.strands).with_maps(HairMaps.each(s.hair, s.absorption))
 
     def _view(self, camera: str, pose: int) -> tuple[Camera, Ints]:
         from appearance.render.coverage import covered_pixels

@@ -14,7 +14,12 @@ from reconstruction import Camera, Mesh, Rig, Strands, read_obj, read_strands
 from reconstruction.arrays import Array
 from reconstruction.files.strands import READABLE
 from reconstruction.head.generic import generic_head
+from simulators.subject.colouring import mixed_absorption
 from simulators.subject.grooms import GROOMS, covering_radius, grow
+
+MIXED = "-mixed"
+"""End of the name of a groom whose strands have several colours."""
+NAMES = (*GROOMS, *(name + MIXED for name in GROOMS))
 
 _APPEARANCE = {
     "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
@@ -39,6 +44,8 @@ class Subject:
     """Hair on a head, in the world frame of the rig at pose 0.
 
     `head` may be None for a hairpiece; `skin` is its diffuse albedo per linear RGB channel.
+    `absorption (n_c, S, 3)`, from root to tip, is that of every strand; None: that of `hair`, which
+    is its mean otherwise.
     """
 
     name: str
@@ -46,23 +53,31 @@ class Subject:
     head: Mesh | None
     hair: HairAppearance
     skin: tuple[float, float, float]
+    absorption: Array | None = None
 
 
 def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subject:
-    """The procedural subject `wavy`, `straight` or `curly`; `strands` overrides their number.
+    """The procedural subject `name` of `NAMES`; `strands` overrides their number.
 
-    The seed moves every strand. Raises `SubjectError` for another name.
+    The seed moves every strand; a groom has the same strands in one colour and `MIXED`. Raises
+    `SubjectError` for another name.
     """
-    if name not in GROOMS:
+    if name not in NAMES:
         raise SubjectError(
-            f"unknown subject {name!r}: choose one of {', '.join(GROOMS)}, or give a strand file "
+            f"unknown subject {name!r}: choose one of {', '.join(NAMES)}, or give a strand file "
             f"({', '.join(READABLE)})"
         )
-    head = generic_head()
+    groom, head = name.removesuffix(MIXED), generic_head()
     # the seed depends on the name, so that the grooms differ in every strand
-    draw = int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])
-    hair = grow(GROOMS[name], head, draw, strands)
-    return Subject(name, hair, head, _APPEARANCE[name], _SKIN[name])
+    draw = int(np.random.SeedSequence([seed, *groom.encode()]).generate_state(1)[0])
+    hair = grow(GROOMS[groom], head, draw, strands)
+    subject = Subject(name, hair, head, _APPEARANCE[groom], _SKIN[groom])
+    if name == groom:
+        return subject
+    absorption = mixed_absorption(hair, draw)
+    red, green, blue = (float(x) for x in absorption.mean(axis=(0, 1)))
+    mean = replace(subject.hair, sigma_a=(red, green, blue))
+    return replace(subject, hair=mean, absorption=absorption)
 
 
 def load_subject(
@@ -79,13 +94,13 @@ def load_subject(
     `ValueError` of the reader.
     """
     path = Path(name_or_file)
-    if name_or_file in GROOMS:
+    if name_or_file in NAMES:
         if head is not None:
             raise SubjectError(f"the subject {name_or_file!r} has its own head: leave out {head}")
         return make_subject(name_or_file, seed)
     if not path.is_file():
         raise SubjectError(
-            f"unknown subject {name_or_file!r}: expected a file or one of {', '.join(GROOMS)}"
+            f"unknown subject {name_or_file!r}: expected a file or one of {', '.join(NAMES)}"
         )
     strands = read_strands(path)
     if len(strands) == 0:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+
 from reconstruction import write_obj, write_strands
 from simulators.subject.drift import Drift
 from simulators.subject.props import Prop
 from simulators.subject.subject import Subject
 
 EXPOSURES = "exposures.jsonl"
+ABSORPTION = "absorption.npy"
 
 
 def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
-    """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`.
+    """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`, and
+    `absorption.npy` of a subject whose strands differ.
 
     All at pose 0; for a prop `prop.json` instead. `exposures.jsonl`, created empty here and written
     by `World`, has the pose of each pulse.
@@ -29,4 +33,6 @@ def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
         write_obj(folder / "head.obj", subject.head)
     appearance = {"hair": subject.hair.to_dict(), "skin": list(subject.skin)}
     (folder / "appearance.json").write_text(json.dumps(appearance, indent=1) + "\n")
+    if subject.absorption is not None:
+        np.save(folder / ABSORPTION, subject.absorption.astype(np.float32))
     (folder / "poses.json").write_text(json.dumps(drift.to_dicts(), indent=1) + "\n")

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reconstruction import Capture, Model, Progress, Strands, silent
 
 
@@ -100,5 +102,7 @@ def evaluate_appearance(model: Model, truth: Path) -> dict[str, Any]:
     if model.has("hair_maps.npz"):
         out["sun_fit"] = out["fitted"]
         out["fitted"] = out["inverse_rendering"] = figures(HairMaps.load(model)[0], sun.skin)
-    out["true"] = figures(HairMaps.of(HairAppearance.from_dict(true["hair"])), true["skin"])
+    hair, each = HairAppearance.from_dict(true["hair"]), truth.parent / "absorption.npy"
+    maps = HairMaps.each(hair, np.load(each)) if each.is_file() else HairMaps.of(hair)
+    out["true"] = figures(maps, true["skin"])
     return out

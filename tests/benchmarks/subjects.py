@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from appearance import HairAppearance, HairScene, build_scene
+from appearance.bsdf.maps import HairMaps, MappedStrands
 from reconstruction import Mesh, Strands, read_obj, read_strands
+from reconstruction.arrays import Array
 from reconstruction.tangents.line_evidence import half_sphere
 from stage_service.cli.support.children import SimulatedRig
 from stage_service.cli.support.commands import FAILED, CommandError
@@ -27,10 +29,15 @@ class Subject:
     head: Mesh | None
     hair: HairAppearance
     skin: tuple[float, float, float]
+    absorption: Array | None = None
 
     def scene(self) -> HairScene:
         """The scene, ready to render."""
-        return build_scene(self.strands, self.head, hair=self.hair, skin=self.skin)
+        scene = build_scene(self.strands, self.head, hair=self.hair, skin=self.skin)
+        if self.absorption is None:
+            return scene
+        maps = HairMaps.each(self.hair, self.absorption)
+        return MappedStrands.alone(scene, self.strands).with_maps(maps)
 
 
 def simulated(rig: Path, name: str, head: Path | None, seed: int) -> Subject:
@@ -44,14 +51,20 @@ def simulated(rig: Path, name: str, head: Path | None, seed: int) -> Subject:
         if done.returncode:
             lines = done.stderr.strip().splitlines()
             raise CommandError(f"simulators: {lines[-1] if lines else 'failed'}", FAILED)
-        truth = Path(folder)
-        appearance = json.loads((truth / "appearance.json").read_text())
-        return Subject(
-            read_strands(truth / "strands.npz"),
-            read_obj(truth / "head.obj") if (truth / "head.obj").is_file() else None,
-            HairAppearance.from_dict(appearance["hair"]),
-            tuple(appearance["skin"]),
-        )
+        return true_subject(Path(folder))
+
+
+def true_subject(truth: Path) -> Subject:
+    """The subject whose truth the simulators wrote to a folder."""
+    appearance, head = json.loads((truth / "appearance.json").read_text()), truth / "head.obj"
+    each = truth / "absorption.npy"
+    return Subject(
+        read_strands(truth / "strands.npz"),
+        read_obj(head) if head.is_file() else None,
+        HairAppearance.from_dict(appearance["hair"]),
+        tuple(appearance["skin"]),
+        np.load(each) if each.is_file() else None,
+    )
 
 
 def cycles_subject(folder: Path) -> tuple[Subject, dict[str, Any]]:

@@ -103,6 +103,25 @@ def test_the_seed_decides_every_byte(subjects):
     assert not np.isin(other.strands.roots[:, 0], again.strands.roots[:, 0]).any()
 
 
+@pytest.mark.parametrize("name", ["wavy", "curly"])
+def test_a_mixed_subject_has_the_strands_of_its_groom_in_several_colours(subjects, name):
+    mixed = make_subject(f"{name}-mixed", 3, strands=1500)
+    assert mixed.strands.points.tobytes() == subjects[name].strands.points.tobytes()
+    layers, count, _ = mixed.absorption.shape
+    assert (layers, count) == (32, 1500)
+    np.testing.assert_allclose(mixed.hair.sigma_a, mixed.absorption.mean(axis=(0, 1)))
+    white = mixed.absorption[..., 1].max(axis=0) < 0.01
+    assert 0.08 < white.mean() < 0.35
+    side = np.abs(mixed.strands.roots[:, 0])
+    assert white[side > 0.07].mean() > 2 * white[side < 0.03].mean()  # at the temples first
+    root, tip = mixed.absorption[0, ~white], mixed.absorption[-1, ~white]
+    assert np.median(tip / root) == pytest.approx(0.35 / 1.5, rel=0.02)
+    # beside each other: a strand's colour does not predict its neighbour's
+    green, roots = np.log(root[:, 1]), mixed.strands.roots[~white]
+    near = cKDTree(roots).query(roots, k=2)[1][:, 1]
+    assert abs(np.corrcoef(green, green[near])[0, 1]) < 0.2
+
+
 def test_a_strand_file_is_a_subject_and_a_thinned_one_gets_thicker(tmp_path, subjects):
     lines = []
     file = tmp_path / "groom.npz"
