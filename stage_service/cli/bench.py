@@ -20,6 +20,7 @@ BENCHMARKS = {
     "bsdf": "our hair BSDF compared with Mitsuba's: tables and images",
     "callers": "load x caller x fault: seconds to a blackout, how much slower a capture is",
     "demo": "recorded demos over subjects and seeds compared with their baselines",
+    "error_parts": "a demo's error on held-out frames, part by part replaced by the truth",
     "exports": "a model opened, rendered and written by Blender, compared with ours",
     "fields": "fields of reflectance compared with baselines on new lights and views",
     "frames": "the simulated frames compared with many paths: error against run time",

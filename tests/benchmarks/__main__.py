@@ -27,6 +27,7 @@ MODULES = {
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "callers": "benchmarks.service.callers",
     "demo": "benchmarks.demo",
+    "error_parts": "benchmarks.appearance.error_parts",
     "exports": "benchmarks.exports.blender",
     "fields": "benchmarks.fields.modulation",
     "frames": "benchmarks.renderers.frames",
