@@ -84,7 +84,8 @@ def mosaic(image: Any) -> Any:
 
 
 def dng(path: Path, counts: Any, white: Any = 4095, **tags: Any) -> None:
-    """RGGB `counts (h, w)`; `tags`: black, repeat, delta_h, delta_v, opcodes."""
+    """RGGB `counts (h, w)`; `tags`: black, repeat, delta_h, delta_v, opcodes, and `more` tags of
+    tifffile's."""
     black = tags.get("black", (256,))
     white = tuple(np.atleast_1d(white))
     whole = [
@@ -102,6 +103,7 @@ def dng(path: Path, counts: Any, white: Any = 4095, **tags: Any) -> None:
         if name in tags:
             pairs = sum(((int(2 * v), 2) for v in tags[name]), ())
             whole.append((number, 10, len(tags[name]), pairs, True))
+    whole += tags.get("more", ())
     if "opcodes" in tags:
         whole.append((51009, 7, len(tags["opcodes"]), tags["opcodes"], True))
     tifffile.imwrite(

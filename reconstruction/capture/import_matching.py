@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 from reconstruction.capture.import_settings import FIELDS, ImportProblem, ImportSettings, Patterns
 from reconstruction.capture.records import Step, StepKind
-from reconstruction.files.encoded import FORMATS, PictureError
+from reconstruction.files.encoded import FORMATS, RAW, PictureError
 from reconstruction.files.pictures import LOSSY, exposure_of
 from reconstruction.geometry.rig import Rig
 
@@ -173,6 +173,11 @@ def _notes(
         out.append(
             "JPEG: compression hides fine hair, and the camera's tone curve is unknown: colour and "
             "roughness are unreliable; use RAW"
+        )
+    if suffixes & RAW and settings.sensor.matrix is None:
+        out.append(
+            "RAW: colours are the sensor's own, the file's ColorMatrix is not applied: give "
+            "`sensor.matrix` if they must be Rec. 709"
         )
     if left:
         out.append(f"{len(left)} images match no pattern: {_few(left)}")

@@ -6,6 +6,7 @@ OpenImageIO reads all but EXR, Radiance, RAW (rawpy) and AVIF (OpenCV).
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from reconstruction.files.colour import Colour, of_code_points, of_icc, to_rec70
 from reconstruction.files.exr import OtherChannels, chosen_image, window_size
 from reconstruction.files.masks import AS_STORED, exif_orientation, png_chunks
 from reconstruction.files.radiance import hdr_size, read_hdr
-from reconstruction.files.tiff_tags import tags_of, tiff_values
+from reconstruction.files.tiff_tags import dng_crop, tags_of, tiff_values
 
 Size = tuple[int, int]
 """Width and height."""
@@ -37,16 +38,25 @@ class PictureError(ValueError):
 @dataclass(frozen=True)
 class Placement:
     """Where a file's pixels lie: `size` as stored, EXIF `orientation` 1 to 8, and `aspect`, a
-    pixel's width by its height."""
+    pixel's width by its height. `crop`: left, top, width and height that RAW recommends to show
+    (DNG's DefaultCropOrigin and DefaultCropSize), which some programs develop and some do not."""
 
     size: Size
     orientation: int = 1
     aspect: float = 1.0
+    crop: tuple[int, int, int, int] | None = None
 
     @property
     def turned(self) -> Size:
         """The size after the orientation."""
         return self.size[::-1] if self.orientation > 4 else self.size
+
+    def of_camera(self, size: Size) -> Placement:
+        """That of the crop where only the crop has a camera's `size`, upright or turned."""
+        if self.crop is None or size in (self.size, self.turned):
+            return self
+        inner = replace(self, size=self.crop[2:])
+        return inner if size in (inner.size, inner.turned) else self
 
 
 def placement(path: Path) -> Placement:
@@ -60,8 +70,7 @@ def placement(path: Path) -> Placement:
             return Placement(hdr_size(path))
         if suffix in RAW:
             with rawpy.imread(str(path)) as raw:
-                turn = {3: 3, 5: 8, 6: 6}.get(raw.sizes.flip, 1)
-                return Placement((int(raw.sizes.width), int(raw.sizes.height)), turn)
+                return _raw_placement(path, raw.sizes)
     except OtherChannels as error:
         raise PictureError(str(error)) from error
     except Exception as error:  # the bindings raise various types
@@ -75,6 +84,21 @@ def placement(path: Path) -> Placement:
         turn = exif_orientation(png_chunks(path.read_bytes()).get(b"eXIf", b""))
     aspect = float(spec.get_float_attribute("PixelAspectRatio", 1.0))
     return Placement((int(spec.width), int(spec.height)), turn, aspect if aspect > 0 else 1.0)
+
+
+def _raw_placement(path: Path, sizes: Any) -> Placement:
+    """From rawpy's `ImageSizes`, whose margins are those of the whole sensor."""
+    width, height = int(sizes.width), int(sizes.height)
+    left, top = sizes.crop_left_margin - sizes.left_margin, sizes.crop_top_margin - sizes.top_margin
+    crop = left, top, sizes.crop_width, sizes.crop_height
+    if path.suffix.lower() == ".dng":
+        with suppress(Exception):  # damage is reported with the pixels
+            crop = dng_crop(path) or crop  # LibRaw's begins at even numbers
+    x, y, w, h = (int(v) for v in crop)
+    there = min(x, y) >= 0 and min(w, h) > 0 and x + w <= width and y + h <= height
+    aspect = sizes.pixel_aspect if sizes.pixel_aspect > 0 else 1.0
+    turn = {3: 3, 5: 8, 6: 6}.get(sizes.flip, 1)
+    return Placement((width, height), turn, float(aspect), (x, y, w, h) if there else None)
 
 
 def stored_values(path: Path) -> tuple[NDArray[Any], float | None, Colour]:

@@ -90,8 +90,9 @@ class Picture:
 
 def picture_size(path: Path, like: Size | None = None) -> Size:
     """Width and height from the header; turned by EXIF where only that fits the camera's size
-    `like`, upright or wide. Raises `PictureError`."""
+    `like`, upright or wide; RAW's crop where `like` is its size. Raises `PictureError`."""
     place = placement(path)
+    place = place if like is None else place.of_camera(like)
     fits = like is None or (place.size[0] > place.size[1]) == (like[0] > like[1])
     return place.size if fits else place.turned
 
@@ -150,7 +151,8 @@ def read_picture(
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise PictureError(f"{path}: unknown format; expected {' '.join(sorted(FORMATS))}")
-    place = placement(path)
+    whole = placement(path)
+    place = whole.of_camera(size)
     turn = _orientation(path, place, sensor, size)
     if aspect is not None and place.aspect != 1 and abs(place.aspect / aspect - 1) > ASPECT:
         raise PictureError(
@@ -173,6 +175,8 @@ def read_picture(
         light = np.asarray(picture.light @ np.array(sensor.matrix).T, np.float32)
         quantum = np.broadcast_to(picture.quantum, light.shape)
         picture = replace(picture, light=light, quantum=quantum)
+    if place is not whole and place.crop is not None:
+        picture = _cropped(picture, place.crop)
     return _turned_picture(picture, turn)
 
 
@@ -194,6 +198,14 @@ def _orientation(path: Path, place: Placement, sensor: Sensor, size: Size) -> in
             'else "turned"'
         )
     return turn if fits == {"turned"} else 1
+
+
+def _cropped(picture: Picture, crop: tuple[int, int, int, int]) -> Picture:
+    left, top, width, height = crop
+    at = slice(top, top + height), slice(left, left + width)
+    step = picture.quantum if np.ndim(picture.quantum) == 0 else picture.quantum[at]
+    light, saturated = picture.light[at], picture.saturated[at]
+    return replace(picture, light=light, saturated=saturated, quantum=step)
 
 
 def _turned_picture(picture: Picture, turn: int) -> Picture:

@@ -51,7 +51,23 @@ def tags_of(path: Path, mosaic: bool = False) -> Tags:
             raise ValueError(f"TIFF tag {missing[0]} is missing or damaged: write the file anew")
         if len(page.dataoffsets) != np.prod(page.chunked):
             raise ValueError(f"{len(page.dataoffsets)} strips, expected {np.prod(page.chunked)}")
+        _check_place(page)
     return {**tagged[0], **tags}
+
+
+def _check_place(page: Any) -> None:
+    """Raise `ValueError` for a strip or tile that begins or ends in the header or a tag."""
+    first = np.array(page.dataoffsets, np.int64)
+    end = first + np.array(page.databytecounts, np.int64)
+    taken = [(0, 8), *((t.offset, 12) for t in page.tags)]
+    taken += [(t.valueoffset, t.valuebytecount) for t in page.tags]
+    for at, size in taken:
+        wrong = (first < at + size) & (end > at)
+        if wrong.any():
+            raise ValueError(
+                f"StripOffsets {first[wrong][0]}: these pixels lie on the file's own tags: write "
+                "the file anew"
+            )
 
 
 def tiff_values(tags: Tags, values: Any) -> tuple[Any, float | None, Colour]:
@@ -79,6 +95,16 @@ def tiff_values(tags: Tags, values: Any) -> tuple[Any, float | None, Colour]:
     return values, white, Colour(None, to_rec709(primaries))
 
 
+def dng_crop(path: Path) -> tuple[float, float, float, float] | None:
+    """Left, top, width and height of DefaultCropOrigin and DefaultCropSize, in the active area of
+    a DNG; None without them. Raises `ValueError`."""
+    tags = tags_of(path, mosaic=True)
+    if 50719 not in tags or 50720 not in tags:
+        return None
+    (left, top), (width, height) = _numbers(tags, 50719, ()), _numbers(tags, 50720, ())
+    return left, top, width, height
+
+
 def dng_levels(path: Path, shape: tuple[int, int], colours: Any) -> tuple[Array, Array]:
     """Black and white `(H, W)` of a DNG's mosaic of `shape`, whose pixels have the `colours` 0, 1,
     2 and 3 (a second green). Raises `ValueError` for levels that do not fit it.
@@ -89,6 +115,12 @@ def dng_levels(path: Path, shape: tuple[int, int], colours: Any) -> tuple[Array,
     tags, (height, width) = tags_of(path, mosaic=True), shape
     for code in (51008, 51009, 51022):
         _check_opcodes(code, tags.get(code, b""))
+    top, left = (int(n) for n in _numbers(tags, 50829, (0, 0))[:2])
+    if top % 2 or left % 2:  # LibRaw would leave out a line, and read another colour's black
+        raise ValueError(
+            f"ActiveArea begins at row {top}, column {left}: expected even numbers: develop it to "
+            "a linear 16-bit TIFF"
+        )
     bits, mosaic = _numbers(tags, 258, ()), tags[33422]
     if len(bits) != 1 or not 8 <= bits[0] <= 16 or set(mosaic) - {0, 1, 2}:
         raise ValueError(f"BitsPerSample {bits}, CFAPattern {list(mosaic)}: expected 8 to 16, RGB")

@@ -1,5 +1,5 @@
-"""Strand files in and out: `.npz`, cyHair `.hair`, USD curves; `.tfx`, USC `.data` and `.ply` in;
-Alembic curves out.
+"""Strand files in and out: `.npz`, cyHair `.hair`, `.ply`, USD and Alembic curves; `.tfx` and USC
+`.data` in.
 
     strands = read_strands("groom.hair")
     write_strands("groom.usdc", strands)
@@ -16,12 +16,12 @@ from typing import Literal
 
 import numpy as np
 
-from reconstruction.files.strands.alembic import write_abc
+from reconstruction.files.strands.alembic import read_abc, write_abc
 from reconstruction.files.strands.cyhair import read_hair, write_hair
 from reconstruction.files.strands.errors import StrandFileError
 from reconstruction.files.strands.npz import read_npz, read_npz_poses, write_npz
 from reconstruction.files.strands.photobooth import read_data
-from reconstruction.files.strands.ply import read_ply_strands
+from reconstruction.files.strands.ply import read_ply_strands, write_ply_strands
 from reconstruction.files.strands.tressfx import read_tfx
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.world_frame import WorldFrame
@@ -52,13 +52,13 @@ def _write_usd(path: Path, strands: Strands, frame: WorldFrame | None = None) ->
 
 _READERS: dict[str, Callable[[Path], Strands]] = {
     **{".npz": read_npz, ".hair": read_hair, ".tfx": read_tfx, ".data": read_data},
-    ".ply": read_ply_strands,
+    **{".ply": read_ply_strands, ".abc": read_abc},
     **dict.fromkeys(_USD, _read_usd),
 }
 _WRITERS: dict[str, Callable[[Path, Strands], None]] = {
     **{".npz": write_npz, ".hair": write_hair},
     **dict.fromkeys(_USD, _write_usd),
-    ".abc": write_abc,
+    **{".ply": write_ply_strands, ".abc": write_abc},
 }
 READABLE = tuple(_READERS)
 WRITABLE = tuple(_WRITERS)
@@ -72,8 +72,8 @@ def read_strands(
     """Read strands from a file of any of the formats `READABLE`, root first.
 
     USD is converted to metres with z up, whatever `up_axis` is. Other formats are read as metres;
-    `up_axis="y"` converts y up to z up, (x, y, z) to (x, -z, y). Strands in the user's `frame` are
-    converted to the stage's.
+    `up_axis="y"`, as of Alembic by custom, converts y up to z up, (x, y, z) to (x, -z, y). Strands
+    in the user's `frame` are converted to the stage's.
 
     Raises `StrandFileError` (a `ValueError`) naming the file and the error.
     """
@@ -84,7 +84,6 @@ def read_strands(
     if reader is None:
         raise StrandFileError(
             f"{path}: unknown strand format {path.suffix!r}; readable are {', '.join(READABLE)}"
-            + (": save Alembic curves as USD" if path.suffix.lower() == ".abc" else "")
         )
     if not path.is_file():
         raise StrandFileError(f"{path}: no such file")
@@ -94,7 +93,7 @@ def read_strands(
         raise StrandFileError(f"{path}: {error}") from error
     if frame is not None:
         return (frame.as_read_from_usd if reader is _read_usd else frame).inputs(strands)
-    if up_axis == "y" and reader is not _read_usd:
+    if (up_axis == "y" or reader is read_abc) and reader is not _read_usd:
         return strands.transformed(_Y_UP_TO_Z_UP, np.zeros(3))
     return strands
 

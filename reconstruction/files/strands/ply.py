@@ -1,4 +1,4 @@
-"""Reading strands of `.ply` files, as the neural methods write them: vertices, strand by strand.
+"""Strands of `.ply` files, as the neural methods write them: vertices, strand by strand.
 
 A PLY has no strands. Their ends are, in this order: where no edge leads from a vertex to the
 next; where the number of the strand or the colour changes, one for each strand; where the step to
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.arrays import Bools, Floats
+from reconstruction.files.durable import writing
 from reconstruction.files.ply import read_ply
-from reconstruction.files.strands.errors import StrandFileError, require_finite
+from reconstruction.files.strands.errors import StrandFileError, radii, require_finite
 from reconstruction.geometry.strands import Strands
 
 GAP = 3.0
@@ -33,13 +34,16 @@ def read_ply_strands(path: Path) -> Strands:
         raise StrandFileError(f"a vertex has {list(vertices)}, expected x, y and z")
     points = np.stack([vertices[n].astype(np.float32) for n in "xyz"], axis=1)
     require_finite(points, np.arange(len(points)))
+    if not len(points) and "edge" in elements:
+        return Strands(points, np.zeros(1, np.int64))
     if len(points) < 2:
         raise StrandFileError(f"{len(points)} vertices make no strand")
+    radius = radii(2.0 * vertices["radius"]) if "radius" in vertices else None
     if edges := elements.get("edge"):
-        return _split(points, ~_joined(edges, len(points)))
+        return _split(points, ~_joined(edges, len(points)), radius)
     number = next((vertices[n] for n in _NUMBERS if n in vertices), None)
     if number is not None:
-        return _split(points, number[1:] != number[:-1])
+        return _split(points, number[1:] != number[:-1], radius)
     steps = np.diff(points, axis=0)
     step = np.linalg.norm(steps, axis=1)
     gaps = step > GAP * np.maximum(np.append(step[1:], 0), np.append(0, step[:-1]))
@@ -53,7 +57,25 @@ def read_ply_strands(path: Path) -> Strands:
             "the strands' ends are unknown: vertices need a strand_id, one colour for each strand, "
             "edges, or the same number of points for each strand"
         )
-    return Strands(points, np.arange(0, len(points) + 1, count))
+    ends = np.zeros(len(points) - 1, bool)
+    ends[count - 1 :: count] = True
+    return _split(points, ends, radius)
+
+
+def write_ply_strands(path: Path, strands: Strands) -> None:
+    """Write vertices x, y, z, the `radius` of each, and edges along the strands, as Blender and
+    MeshLab show them."""
+    first = np.setdiff1d(np.arange(len(strands.points)), strands.offsets[1:] - 1)
+    vertices = np.empty((len(strands.points), 4), "<f4")
+    vertices[:, :3], vertices[:, 3] = strands.points, strands.radius
+    numbers = "".join(f"property float {n}\n" for n in ("x", "y", "z", "radius"))
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{numbers}"
+        f"element edge {len(first)}\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    )
+    with writing(path) as temporary:
+        edges = np.stack([first, first + 1], axis=1).astype("<i4")
+        temporary.write_bytes(head.encode() + vertices.tobytes() + edges.tobytes())
 
 
 def _joined(edges: dict[str, NDArray[Any]], vertices: int) -> Bools:
@@ -89,6 +111,7 @@ def _common(ends: Bools) -> int:
     return best
 
 
-def _split(points: Floats, ends: Bools) -> Strands:
+def _split(points: Floats, ends: Bools, radius: float | Floats | None) -> Strands:
     """Strands that end at the points `ends (N - 1,)`, and at the last."""
-    return Strands(points, np.concatenate([[0], np.flatnonzero(ends) + 1, [len(points)]]))
+    offsets = np.concatenate([[0], np.flatnonzero(ends) + 1, [len(points)]])
+    return Strands(points, offsets) if radius is None else Strands(points, offsets, radius)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 USD = (".usd", ".usda", ".usdc")
 SUFFIXES = {
     **{"usd": USD, "houdini": USD, "unreal": (".abc",), "abc": (".abc",), "hair": (".hair",)},
-    "gltf": (".glb",),
+    **{"ply": (".ply",), "gltf": (".glb",)},
 }
 FOLDERS = ("blender", "mitsuba", "maps")
 ONLY = {
@@ -32,7 +32,7 @@ ONLY = {
     "environment": ("mitsuba",),
 }
 """Targets that accept these options."""
-STRANDS = ("abc", "hair")
+STRANDS = ("abc", "hair", "ply")
 """Formats of strands alone, without a fit."""
 SIZE = 640
 """Width in pixels of a Mitsuba scene's camera without --camera."""
@@ -76,9 +76,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     MaterialX hair, z up; houdini: the same, y up; blender: a folder with a script that makes Hair
     Curves with Principled Hair; unreal: Alembic in centimetres with groom_ attributes; gltf: hair
     cards in three levels of detail; mitsuba: a folder with a scene for stock Mitsuba 3; maps: an
-    OpenEXR file for each layer of the hair maps; abc, hair: the strands alone, as Alembic and
-    cyHair. Results of imported captures come in the user's world: usd, abc and hair in the unit and
-    axes of the cameras' files, the others in their own.
+    OpenEXR file for each layer of the hair maps; abc, hair, ply: the strands alone, as Alembic,
+    cyHair and PLY. Results of imported captures come in the user's world: usd, abc, hair and ply in
+    the unit and axes of the cameras' files, the others in their own.
     """
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions

@@ -18,6 +18,7 @@ from reconstruction.files.exr import read_exr
 from reconstruction.files.pictures import PictureError, Sensor, picture_size, read_picture
 from reconstruction.files.radiance import read_hdr
 
+LARGE = 1_000_000
 ROOM, PLACE = (W + 3, H + 4), (2, 1)
 """Display window, and the data window's place in it."""
 
@@ -38,14 +39,16 @@ def exr_by_oiio(path: Path) -> Any:
     spec, pixels = source.spec(), source.read_image(0, 0, 0, 3, oiio.FLOAT)
     if pixels is None or list(spec.channelnames[:3]) != ["R", "G", "B"]:
         return None
+    xy = spec.getattribute("chromaticities")
+    if xy is not None:
+        pixels = pixels @ _to_rec709(np.reshape(xy, (4, 2))).T
     out = np.zeros((spec.full_height, spec.full_width, 3), np.float32)
     for y in range(spec.height):
         for x in range(spec.width):
             row, column = y + spec.y - spec.full_y, x + spec.x - spec.full_x
             if 0 <= row < spec.full_height and 0 <= column < spec.full_width:
                 out[row, column] = pixels[y, x]
-    xy = spec.getattribute("chromaticities")
-    return out if xy is None else out @ _to_rec709(np.reshape(xy, (4, 2))).T
+    return out
 
 
 def _to_rec709(xy: Any) -> Any:
@@ -157,22 +160,19 @@ def test_a_wrong_header_never_changes_the_light_silently(suffix, count, tmp_path
     whole = path.read_bytes()
     first = ours(path)
     np.testing.assert_allclose(first, reference(path), atol=2e-3)
-    start, end, offset = 0, length, -12
-    if suffix in ("tif", "dng"):  # where the pixels are is no statement about them
+    start, end = 0, length
+    if suffix in ("tif", "dng"):
         start = struct.unpack_from("<I", whole, 4)[0]
-        end, offset = min(length, start + 1000), whole.index(struct.pack("<H", 273), start)
-    places = [at for at in range(start, end) if not offset <= at < offset + 12]
+        end = min(length, start + 1000)
     for _ in range(count):
         data = bytearray(whole)
-        for at in rng.choice(places, rng.integers(1, 3)):
+        for at in rng.integers(start, end, rng.integers(1, 3)):
             data[at] = rng.choice([rng.integers(256), data[at] ^ (1 << rng.integers(8))])
         path.write_bytes(data)
         try:
             found = ours(path)
         except (PictureError, ValueError):
             continue
-        if found.size > 1e6:
-            continue  # an import compares the size with the camera's
         try:
             expected = reference(path)
         except Exception:  # it cannot read the file: only the original light is right
@@ -180,6 +180,10 @@ def test_a_wrong_header_never_changes_the_light_silently(suffix, count, tmp_path
         if expected is None or expected.shape != found.shape:
             expected = first
         same = found.shape == expected.shape
+        if same and found.size > LARGE:  # of a display window: some lines and columns of it
+            step = -(-found.size // LARGE)
+            rows = np.unique([*range(0, len(found), step), *np.flatnonzero(expected.any((1, 2)))])
+            found, expected = found[rows], expected[rows]
         if not (same and np.allclose(found, expected, rtol=0.01, atol=2e-3, equal_nan=True)):
             changed = [(i, whole[i], data[i]) for i in range(len(data)) if data[i] != whole[i]]
             silent.append((changed, found.shape))

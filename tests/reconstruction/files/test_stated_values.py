@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
@@ -264,6 +265,36 @@ def test_a_sensor_that_clips_below_the_stated_white_is_saturated_there(tmp_path)
     assert not read(tmp_path / "b.dng").saturated.any()
 
 
+@pytest.mark.parametrize(
+    ("margins", "crop"),
+    [
+        ((0, 0, 0, 0), None),
+        ((4, 6, 2, 8), None),  # masked pixels around the active area
+        ((4, 6, 2, 8), (2, 4, 20, 14)),
+        ((0, 0, 2, 2), (3, 5, 21, 15)),
+    ],
+)
+def test_dng_pixels_lie_in_the_active_area_or_its_crop(tmp_path, margins, crop):
+    """By the camera's size. ActiveArea is top, left, bottom, right; the crop is in it (DNG)."""
+    top, left, bottom, right = margins
+    counts = np.full((H + top + bottom, W + left + right), 4000.0)
+    counts[top : top + H, left : left + W] = BY_COLOUR + files.mosaic(LIGHT) * (4095 - BY_COLOUR)
+    more = [(50829, 4, 4, (top, left, top + H, left + W), True)]
+    if crop:
+        more += [(50719, 3, 2, crop[:2], True), (50720, 3, 2, crop[2:], True)]
+    path, levels = tmp_path / "a.dng", {"black": (200, 256, 264, 330), "repeat": (2, 2)}
+    files.dng(path, counts, **levels, more=more)
+    assert picture_size(path) == (W, H)
+    even = (cv2.Laplacian(LIGHT, cv2.CV_32F) == 0).all(axis=-1) * np.uint8(1)
+    even = cv2.erode(even, np.ones((5, 5), np.uint8)) > 0
+    x, y, w, h = crop or (0, 0, W, H)
+    for size, at in (((W, H), np.s_[:, :]), ((w, h), np.s_[y : y + h, x : x + w])):
+        found = read(path, size)
+        assert picture_size(path, size) == size
+        np.testing.assert_allclose(found.light[even[at]], LIGHT[at][even[at]], atol=6e-4)
+        assert found.saturated.shape == found.light.shape[:2]
+
+
 WARP = struct.pack(">I4I", 1, 1, 0x01030000, 0, 4) + bytes(4)
 
 
@@ -274,12 +305,23 @@ WARP = struct.pack(">I4I", 1, 1, 0x01030000, 0, 4) + bytes(4)
         ({"black": (1, 2, 3), "repeat": (2, 2)}, "BlackLevel has 3 values: expected 4"),
         ({"black": (5000,)}, "black 5000 must be below white 4095"),
         ({"opcodes": WARP}, "OpcodeList2 has WarpRectilinear"),
+        (
+            {"more": [(50829, 4, 4, (0, 0, H, W), True), (50718, 5, 2, (2, 1, 1, 1), True)]},
+            "pixelAspectRatio 2, but",
+        ),
     ],
 )
 def test_dng_levels_that_do_not_fit_are_refused(tmp_path, how, says):
     files.dng(tmp_path / "a.dng", np.full((H, W), 1000), **how)
     with pytest.raises(PictureError, match=rf"a\.dng: {says}"):
         read(tmp_path / "a.dng")
+
+
+def test_an_active_area_from_an_odd_row_on_is_refused(tmp_path):
+    more = [(50829, 4, 4, (3, 6, H + 3, W + 6), True)]
+    files.dng(tmp_path / "a.dng", np.full((H + 3, W + 6), 1000), more=more)
+    with pytest.raises(PictureError, match="ActiveArea begins at row 3, column 6: expected even"):
+        read(tmp_path / "a.dng", picture_size(tmp_path / "a.dng"))
 
 
 ICC = {

@@ -295,11 +295,12 @@ def test_edits_that_cannot_be_made_are_one_sentence(made, capsys, tmp_path, word
 @pytest.mark.usefixtures("fitted")
 def test_exports_are_what_other_readers_open(made, capsys, tmp_path):
     files = {"usd": "h.usdc", "hair": "h.hair", "abc": "h.abc", "unreal": "u.abc", "gltf": "h.glb"}
+    files["ply"] = "h.ply"
     for kind, name in files.items():
         code, found = run(capsys, "export", made.model, "--to", kind, "--out", tmp_path / name)
         assert (code, found["files"][0]) == (0, str(tmp_path / name))
     assert (tmp_path / "h.abc").read_bytes().startswith(b"Ogawa")
-    for name in ("h.usdc", "h.hair"):
+    for name in ("h.usdc", "h.hair", "h.abc", "h.ply"):
         assert len(read_strands(tmp_path / name)) == 200
     code, found = run(capsys, "export", made.model, "--to", "maps", "--out", tmp_path / "maps")
     assert code == 0
