@@ -23,8 +23,8 @@ class OtherChannels(ValueError):
     """A valid file without one image of R, G and B, or with attributes that are not read."""
 
 
-MOST_PIXELS = 1 << 28
-"""Pixels of a display window; the largest sensors have 151 million."""
+MOST_PIXELS, MOST_SIDE = 1 << 28, 1 << 16
+"""Pixels of a display window, and of its longer side; the largest sensors have 151 million."""
 
 
 def read_exr(path: str | Path) -> tuple[Floats, dict[str, float | str]]:
@@ -102,8 +102,11 @@ def _check(path: str | Path, header: Mapping[str, Any]) -> None:
         wrong = f"type {str(header['type']).split('.')[-1]}: flatten the deep samples"
     elif "CUBE" in str(header.get("envmap", "")):
         wrong = "envmap cube: write a lat-long map"
-    elif width * height > MOST_PIXELS:
-        wrong = f"displayWindow has {width}x{height} pixels: at most {MOST_PIXELS:,} are read"
+    elif width * height > MOST_PIXELS or max(width, height) > MOST_SIDE:
+        wrong = (
+            f"displayWindow has {width}x{height} pixels: at most {MOST_PIXELS:,} are read, and "
+            f"{MOST_SIDE:,} in a line"
+        )
     elif white is not None:
         wrong = f"whiteLuminance {white:g} cd/m²: write radiance, without this attribute"
     elif neutral is not None and not np.allclose(neutral, _chromaticities(header)[6:], atol=1e-3):

@@ -46,7 +46,11 @@ def tags_of(path: Path, mosaic: bool = False) -> Tags:
         elif whole != [0]:
             raise ValueError(f"{len(pages)} images: write one image in a file")
         page, tags = pages[whole[0]], tagged[whole[0]]
-        missing = [n for n in (_NEEDED | {277, 33422} if mosaic else _NEEDED) if n not in tags]
+        codes = [int(t.code) for t in page.tags]
+        if twice := sorted(n for n in codes if codes.count(n) > 1):
+            raise ValueError(f"TIFF tag {twice[0]} occurs twice: write the file anew")
+        needed = _NEEDED | {277, 33422} if mosaic else _NEEDED
+        missing = [n for n in needed if np.size(tags.get(n, ())) == 0]
         if missing:
             raise ValueError(f"TIFF tag {missing[0]} is missing or damaged: write the file anew")
         if len(page.dataoffsets) != np.prod(page.chunked):
@@ -121,6 +125,8 @@ def dng_levels(path: Path, shape: tuple[int, int], colours: Any) -> tuple[Array,
             f"ActiveArea begins at row {top}, column {left}: expected even numbers: develop it to "
             "a linear 16-bit TIFF"
         )
+    if (np.diff(_numbers(tags, 50712, ())) < 0).any():  # LibRaw has applied it
+        raise ValueError("LinearizationTable decreases: develop it to a linear 16-bit TIFF")
     bits, mosaic = _numbers(tags, 258, ()), tags[33422]
     if len(bits) != 1 or not 8 <= bits[0] <= 16 or set(mosaic) - {0, 1, 2}:
         raise ValueError(f"BitsPerSample {bits}, CFAPattern {list(mosaic)}: expected 8 to 16, RGB")

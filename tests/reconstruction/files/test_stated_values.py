@@ -113,6 +113,8 @@ SPOILT[2, 3] = np.nan
         (exr_deep, "deepscanline: flatten"),
         (lambda p: files.exr(p, LIGHT, dataWindow=((90, 0), (89 + W, H - 1)),
                              displayWindow=((0, 0), (W - 1, H - 1))), "outside displayWindow"),
+        (lambda p: files.exr(p, LIGHT, displayWindow=((0, 0), (70000, 1))),
+         "70001x2 pixels: at most"),
         (lambda p: files.exr(p, LIGHT, whiteLuminance=100.0), "whiteLuminance 100 cd"),
         (lambda p: files.exr(p, LIGHT, adoptedNeutral=(0.44, 0.41)), "adoptedNeutral 0.44 0.41"),
         (lambda p: files.exr(p, LIGHT, pixelAspectRatio=2.0), "pixelAspectRatio 2,.*fy / fx"),
@@ -315,6 +317,21 @@ def test_dng_levels_that_do_not_fit_are_refused(tmp_path, how, says):
     files.dng(tmp_path / "a.dng", np.full((H, W), 1000), **how)
     with pytest.raises(PictureError, match=rf"a\.dng: {says}"):
         read(tmp_path / "a.dng")
+
+
+def test_dng_values_are_linear_by_the_table_and_then_above_black(tmp_path):
+    """By a table of squares (DNG 1.7, LinearizationTable): what the sensor encoded as its root."""
+    table = np.rint(np.linspace(0, 1, 4096) ** 2 * 4095).astype(int)
+    counts = np.searchsorted(table, np.rint(256 + files.mosaic(LIGHT) * (4095 - 256)))
+    for name, values, ok in (("a.dng", table, True), ("b.dng", table[::-1], False)):
+        more = [(50712, 3, len(table), tuple(map(int, values)), True)]
+        files.dng(tmp_path / name, counts, more=more)
+        if ok:
+            light = read(tmp_path / name).light
+            for y, x in ((1, 20), (8, 10), (17, 25)):
+                np.testing.assert_allclose(light[y, x], LIGHT[y, x], atol=1e-3)
+    with pytest.raises(PictureError, match="LinearizationTable decreases"):
+        read(tmp_path / "b.dng")
 
 
 def test_an_active_area_from_an_odd_row_on_is_refused(tmp_path):
