@@ -23,6 +23,7 @@ from reconstruction.head.capture_head import HeadPoints, digitised_points
 from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
 from reconstruction.head.lit_skin import MOST_LIGHTS
 from reconstruction.images.orientation import responses
+from reconstruction.images.silhouettes import under_constant_light
 from reconstruction.light_codes.codes import WORD
 from reconstruction.light_codes.line_strands import MOST_LINES
 from reconstruction.light_codes.search import STEP_PIXELS
@@ -132,7 +133,13 @@ class _Probe:
 
     @cached_property
     def lights(self) -> int:
-        return len(self.capture.olat_lights())
+        """Images of a camera that give directions: under single lights, else one fully lit."""
+        return len(self.capture.olat_lights()) or int(under_constant_light(self.capture))
+
+    @property
+    def kind(self) -> StepKind:
+        """The kind of these images."""
+        return "all_on" if under_constant_light(self.capture) else "olat"
 
     @cached_property
     def slowness(self) -> float:
@@ -170,9 +177,9 @@ class _Probe:
 
     @cached_property
     def read(self) -> float:
-        """Seconds to read a frame under a single light, 0 without any."""
+        """Seconds to read one of the images that give directions, 0 without any."""
         self.progress("reading frames", 0.1)
-        return self.reading("olat") if self.frames("olat") else 0.0
+        return self.reading(self.kind) if self.frames(self.kind) else 0.0
 
     @property
     def again(self) -> float:
@@ -317,7 +324,7 @@ class _Probe:
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:
         lights, n, bank = self.lights, self.points, self.options.measure.bank
         groups = min(LIGHT_GROUPS, lights) * len(self.cameras)
-        measured = self.frames("olat") * self.again + groups * self.filtering(bank)
+        measured = self.frames(self.kind) * self.again + groups * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
         images = self.pixels * (5 * lights + 8 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
@@ -332,7 +339,7 @@ class _Probe:
     ) -> tuple[float, float]:
         """Add its stages; returns the numbers of agreed segments and of traced lines."""
         cameras, lights, hair = len(self.cameras), self.lights, self.hair
-        frames, bank = self.frames("olat"), self.options.light_codes.bank
+        frames, bank = self.frames(self.kind), self.options.light_codes.bank
         measured = frames * (self.again + self.filtering(bank))
         add(
             "lightcodes",
@@ -374,7 +381,7 @@ class _Probe:
     def filtering(self, bank: LogGaborBank) -> float:
         """Seconds of a filter bank on one image."""
         self.progress("filtering", 0.6)
-        step, camera = self.a_frame("olat")
+        step, camera = self.a_frame(self.kind)
         image = self.capture.frame(step, camera).mean(axis=-1)
         few = replace(bank, count=min(bank.count, 8))  # large images take minutes
         _ = responses(few, image)

@@ -21,7 +21,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.capture.records import CaptureError
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
-from reconstruction.geometry.mesh_queries import mesh_depth
+from reconstruction.geometry.mesh_queries import mesh_depth, mesh_silhouette
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.hair_features import (
     TwoClasses,
@@ -29,7 +29,12 @@ from reconstruction.images.hair_features import (
     looks,
     two_classes,
 )
-from reconstruction.images.silhouettes import NoSilhouette, silhouette
+from reconstruction.images.silhouettes import (
+    NoSilhouette,
+    edges,
+    silhouette,
+    under_constant_light,
+)
 from reconstruction.images.visual_hull import trim_edges, visual_hull
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.mask_geometry import MaskGeometry, positions
@@ -95,9 +100,12 @@ def hair_masks(
     """Masks of every camera that has a user's mask or a silhouette.
 
     `points` are in the reference pose, `head` is the digitised head in the world. A camera with
-    neither a frame nor a user's mask is omitted. An empty silhouette gives empty masks.
+    neither a frame nor a user's mask is omitted. An empty silhouette gives empty masks. Under
+    constant light a lit background is part of the silhouette: the subject is then the user's hair
+    mask and the head. Raises `CaptureError` if one of them is missing.
     """
     geometry, masks, views = MaskGeometry.of(points, head), {}, []
+    constant = under_constant_light(capture)
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         if user is None and not any(capture.has(s, camera.name) for s in capture.steps):
@@ -108,6 +116,15 @@ def hair_masks(
             if user is None:
                 continue
             subject = user
+        if constant and _reaches_edges(subject) and capture.subject(camera.name) is None:
+            if user is None or head is None:
+                raise CaptureError(
+                    f"{capture.path}: {camera.name}: under constant light a lit background cannot "
+                    "be separated from the subject: provide masks of the subject "
+                    "(subjects/CAMERA.png) and its hair (masks/CAMERA.png), or head.obj and hair "
+                    "masks"
+                )
+            subject = mesh_silhouette(camera, head)
         if user is not None:
             masks[camera.name] = HairMask(subject | user, user, subject & ~user, "user", 1.0)
         elif not subject.any():
@@ -333,6 +350,11 @@ def disagreements(
             against = np.where(hair[mine][there], share < 0.25, share > 0.75)
             out[name] = float(against.mean())
     return out
+
+
+def _reaches_edges(subject: Bools) -> bool:
+    """Whether the `subject (H, W)` covers half of the image's edges."""
+    return bool(2 * subject[edges(subject)].sum() > edges(subject).sum())
 
 
 def _beside(covered: Bools, camera: Camera, depth: Array) -> Bools:

@@ -19,6 +19,7 @@ from reconstruction.growth.hair_envelope import SHELL, build_hull
 from reconstruction.head.capture_head import FittedHead
 from reconstruction.head.heads import Heads
 from reconstruction.head.scalp import find_scalp
+from reconstruction.images.silhouettes import under_constant_light
 from reconstruction.light_codes.line_strands import SEGMENT_WEIGHT, merge, roots_first
 from reconstruction.light_planes import Motion, PointCloud
 from reconstruction.masks import MaskedCapture
@@ -159,10 +160,12 @@ class _Run:
     def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
         """Strands along the smooth field of the hull's surface and all measured lines.
 
-        Single lights give directions, and line stereo if pixels are at most `FINE_PIXEL` wide.
-        Without single lights nothing is measured; without a head no strand has a root.
+        Single lights, or photographs under constant light, give directions, and line stereo if
+        pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without a head no
+        strand has a root.
         """
-        o, olat, report = self.stages.options, masked.capture.olat_lights(), self.stages.report
+        o, capture, report = self.stages.options, masked.capture, self.stages.report
+        lit = bool(capture.olat_lights()) or under_constant_light(capture)
         mesh = None if head is None else head.mesh
         scale = self.measuring.scale(masked, cloud, head)
         if mesh is None:
@@ -172,12 +175,12 @@ class _Run:
             envelope, depths = self.measuring.envelope(masked, cloud, mesh, scale)
             bare = inside_mesh(envelope, mesh)
         measured, polylines = Measured.none(), list[AnyFloats]()
-        if olat:
+        if lit:
             measured = self.measuring.tangents(masked, cloud, depths, scale)
         written = measured
         with report.stage("line stereo") as stage:
-            if not olat:
-                stage.warn("no single lights: nothing is measured, all strands are guessed")
+            if not lit:
+                stage.warn("no lit frames: nothing is measured, all strands are guessed")
             elif scale.pixel > FINE_PIXEL:
                 why = (
                     f"a pixel is {1e3 * scale.pixel:.1f} mm wide, more than {1e3 * FINE_PIXEL:g} mm"

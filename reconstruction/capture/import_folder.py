@@ -2,10 +2,11 @@
 
 folder/
   cameras.json      {"cameras": [{"id", "width", "height", "K", "R", "t"}, ...]}
-  lights.json       {"lights": [{"id", "position", "intensity", "colocated_camera"}, ...]}
+  lights.json       {"lights": [{"id", "position", "intensity", "colocated_camera"}, ...]}, optional
   projectors.json   {"projectors": [...]} as in a capture's rig.json, optional
   import.toml       names and encoding of the images (`ImportSettings`), optional
   images/<camera>/<light>.*      the image under that light alone, unless import.toml has a pattern
+  images/<camera>.*              without lights.json: the photograph under constant light
   masks/<camera>.png             hair masks, optional
   subjects/<camera>.png          masks of hair, head and body, optional
   head.obj                       the head's mesh in the same frame, optional
@@ -138,7 +139,7 @@ class Import:
         )
         projectors = projectors_of(folder / "projectors.json")
         given = Rig(folder.name, tuple(geometry.cameras.values()), tuple(lights), projectors)
-        of_lights = "lights" if own or not geometry.lights else ""
+        of_lights = "lights" if lights and (own or not geometry.lights) else ""
         check_metres(folder, given, "cameras" if own else "", of_lights)
         origin = Origin.of(given.cameras)
         given = origin.rig(given)

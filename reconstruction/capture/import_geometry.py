@@ -61,17 +61,14 @@ CAMERA_FILES = (
 )
 LIGHT_FILES = ("lights.csv", "lights.txt", "lights.npy", "lights.mat")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".r3d")
-CONSTANT = (
-    "images under one light at a time are needed: sets under constant light (NeRSemble, "
-    "GaussianHaircut) cannot be used"
-)
 
 
 def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
     """`given` with paths in `folder`, completed by the first of `CAMERA_FILES` and `LIGHT_FILES`.
 
-    The folder's own cameras.json and lights.json take precedence over the latter. Raises
-    `PlacementError` if there is no file of cameras or lights.
+    The folder's own cameras.json and lights.json take precedence over the latter. Without a file of
+    lights the photographs are taken as under constant light. Raises `PlacementError` if there is no
+    file of cameras.
     """
     cameras, lights = (None if p is None else folder / p for p in (given.cameras, given.lights))
     if cameras is None and folder.is_dir() and not (folder / "cameras.json").is_file():
@@ -79,7 +76,8 @@ def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
         if cameras is None:
             if video := next((p for p in folder.rglob("*") if p.suffix.lower() in VIDEOS), None):
                 raise PlacementError(
-                    f"{video}: videos are not read: extract the frame of each light; {CONSTANT}"
+                    f"{video}: videos are not read: extract its frames, and solve their cameras "
+                    "with COLMAP"
                 )
             raise PlacementError(
                 f"{folder}: no file of cameras: give --cameras (a COLMAP folder, transforms.json, "
@@ -87,11 +85,6 @@ def files_in(folder: Path, given: GeometryFiles) -> GeometryFiles:
             )
     if cameras is not None and lights is None and not (folder / "lights.json").is_file():
         lights = next((p for n in LIGHT_FILES if (p := folder / n).exists()), None)
-        if lights is None:
-            raise PlacementError(
-                f"{folder}: no file of lights: give --lights (.csv, .json, .npy or .obj of their "
-                f"positions or directions) or add lights.json; {CONSTANT}"
-            )
     return replace(given, cameras=cameras, lights=lights)
 
 

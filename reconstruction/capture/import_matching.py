@@ -6,11 +6,17 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from reconstruction.capture.import_settings import FIELDS, ImportProblem, ImportSettings, Patterns
+from reconstruction.capture.import_settings import (
+    FIELDS,
+    PHOTOGRAPHS,
+    ImportProblem,
+    ImportSettings,
+    Patterns,
+)
 from reconstruction.capture.records import Step, StepKind
 from reconstruction.files.encoded import FORMATS, RAW, PictureError
 from reconstruction.files.pictures import LOSSY, exposure_of
@@ -60,11 +66,12 @@ class _Match:
 def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     """Match all files in `folder` with the patterns and the names in `rig`.
 
-    Raises `ImportProblem` for an invalid pattern, no single-light image, two files for one frame,
-    or rows without an order among tracking frames.
+    Raises `ImportProblem` for an invalid pattern, no single-light image (or, for a rig without
+    lights, no photograph), two files for one frame, or rows without an order among tracking frames.
     """
     names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
-    patterns, reader = settings.pictures, _Names(rig, settings)
+    reader, needed = _Names(rig, settings), "olat" if rig.lights else "all_on"
+    patterns = settings.pictures if rig.lights else _of_photographs(settings.pictures, reader, names)
     matches: dict[str, list[_Match]] = {}
     used: set[Path] = set()
     for role in (f for f in vars(patterns) if getattr(patterns, f)):
@@ -94,8 +101,8 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
         steps.append(step)
         for camera, bracket in _brackets(group).items():
             frames[step.index, camera] = bracket
-    if not any(s.kind == "olat" for s in steps):
-        raise ImportProblem(reader.why_none(folder, patterns.olat, names))
+    if not any(s.kind == needed for s in steps):
+        raise ImportProblem(reader.why_none(folder, getattr(patterns, needed), names))
     plates: dict[tuple[str | None, str], Bracket] = {}
     for light in {m.light for m in matches.get("clean_plate", [])}:
         of_light = [m for m in matches["clean_plate"] if m.light == light]
@@ -112,6 +119,16 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
         tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
+
+
+def _of_photographs(patterns: Patterns, reader: _Names, names: Mapping[str, Path]) -> Patterns:
+    """`patterns` for a set without lights: defaults become the first of `PHOTOGRAPHS` that match."""
+    chosen = {}
+    for role, places in PHOTOGRAPHS.items():
+        if getattr(patterns, role) == getattr(Patterns(), role):
+            matching = (p for p in places if reader.matching(role, p, names))
+            chosen[role] = next(matching, places[0])
+    return replace(patterns, olat="", **chosen)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -181,7 +198,12 @@ def _notes(
         )
     if left:
         out.append(f"{len(left)} images match no pattern: {_few(left)}")
-    if settings.units is None and settings.grey_ball is None and suffixes - {".exr"}:
+    if not rig.lights:
+        out.append(
+            "no lights: photographs under constant light; strands follow masks and texture, and "
+            "'hairstage fit' needs images under one light at a time"
+        )
+    elif settings.units is None and settings.grey_ball is None and suffixes - {".exr"}:
         out.append(
             "relative units: hair albedo is relative until you provide `scale` or a grey ball "
             "(docs/how-to/import.md)"
@@ -317,13 +339,15 @@ class _Names:
         return [f"images differ in ISO or aperture ({several}): only exposure times are corrected"]
 
     def why_none(self, folder: Path, pattern: str, names: Mapping[str, Path]) -> str:
-        """Why no file is a single-light image."""
+        """Why no file is an image that is needed."""
         pictures = [n for n, p in names.items() if p.suffix.lower() in FORMATS]
         if not pictures:
             return f"{folder}: no images ({' '.join(sorted(FORMATS))})"
+        lights = f" and a light of {_few(self.lights)}" if self.lights else ""
+        way = "" if lights else ", or lights (lights.json, --lights) if each shows one"
         return (
-            f"{folder}: no file matches {pattern!r} with a camera of {_few(self.cameras)} and a "
-            f"light of {_few(self.lights)}; found {_few(pictures)}: give --pictures a pattern"
+            f"{folder}: no file matches {pattern!r} with a camera of {_few(self.cameras)}{lights}; "
+            f"found {_few(pictures)}: give --pictures a pattern{way}"
         )
 
 

@@ -29,7 +29,9 @@ class Patterns:
     zeros before it (7, 07, light_07); `{exposure}` is seconds (`0.02`, `1-50`) or a key of
     `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for tracking
     frames and rows (lights captured once may be counted per camera); `*` is any text.
-    `clean_plate` shows the stage without the subject, `flat` an evenly lit field.
+    `clean_plate` shows the stage without the subject, `flat` an evenly lit field. Without lights
+    `olat` is not used, and `all_on`, `hair` and `subject` default to the first of `PHOTOGRAPHS`
+    that match a file.
     """
 
     olat: str = "images/{camera}/{light}.*"
@@ -41,6 +43,21 @@ class Patterns:
     flat: str | None = None
     hair: str = "masks/{camera}.png"
     subject: str = "subjects/{camera}.png"
+
+
+PHOTOGRAPHS = {
+    "all_on": ("images/{camera}.*", "images_2/{camera}.*", "image/{camera}.*"),
+    "hair": (
+        *("masks/{camera}.png", "masks/hair/{camera}.png", "masks_2/hair/{camera}.png"),
+        "hair_mask/{camera}.png",
+    ),
+    "subject": (
+        *("subjects/{camera}.png", "masks/body/{camera}.png", "masks_2/body/{camera}.png"),
+        "mask/{camera}.png",
+    ),
+}
+"""Photographs under constant light and their masks: hairstage, COLMAP and nerfstudio,
+GaussianHaircut (run.sh, calc_masks.py), NeuralHaircut (preprocess_custom_data)."""
 
 
 @options

@@ -125,7 +125,10 @@ def cameras_of(path: Path) -> dict[str | int, Camera]:
 
 
 def lights_of(path: Path, cameras: dict[str | int, str], length: Unit = "m") -> list[Light]:
-    """Lights in the file's unit, `length`; `cameras` are names by id, for `colocated_camera`."""
+    """Lights in the file's unit, `length`, none without the file; `cameras` are names by id, for
+    `colocated_camera`."""
+    if not path.is_file():
+        return []
     entries, data = _entries(path, "lights")
     for field, unit in (("position", length), ("intensity", "W/sr")):
         units = data.get("units", {})
@@ -212,7 +215,7 @@ def check_metres(folder: Path, rig: Rig, *own: str) -> None:
         sight = Sight.of(rig.cameras)
     except PlacementError:
         return
-    lights = np.array([x.position for x in rig.lights])
+    lights = np.array([x.position for x in rig.lights]).reshape(-1, 3)
     far = {"cameras": sight.distance, "lights": np.linalg.norm(lights - sight.point, axis=1)}
     for kind in filter(None, own):
         distance = float(np.median(far[kind]))

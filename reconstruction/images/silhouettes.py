@@ -18,6 +18,7 @@ MOST_SATURATED = 0.02
 MOST_LIGHTS = 32  # that are compared with a lit background
 LIKE_BACKGROUND = 1.5  # times its radiance
 SMALLEST = 6  # pixels: smaller specks are noise
+CONSTANT_LIGHT = "the light is constant"
 
 
 class NoSilhouette(ValueError):
@@ -92,6 +93,20 @@ def _half_sample_mode(values: AnyFloats) -> float:
     return float(np.mean(values)) if len(values) else 0.0
 
 
+def under_constant_light(capture: Capture) -> bool:
+    """Whether the capture has fully lit frames and none of single lights."""
+    return bool(capture.of_kind("all_on")) and not capture.olat_lights()
+
+
+def lit_frame(capture: Capture, camera: str) -> tuple[Floats, Bools]:
+    """`dark_response` of the camera's first fully lit frame; black and saturated without one."""
+    for step in capture.of_kind("all_on"):
+        if capture.has(step, camera):
+            return dark_response(capture, step, camera)
+    c = capture.rig.camera(camera)
+    return np.zeros((c.height, c.width, 3), np.float32), np.ones((c.height, c.width), bool)
+
+
 def lit_image(capture: Capture, camera: str) -> Floats:
     """`lit_rgb`'s mean over the channels `(H, W)`."""
     return grey(lit_rgb(capture, camera))
@@ -157,8 +172,7 @@ def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
     they differ from each other, as those of hair that fills an image do, or if nothing is much
     brighter.
     """
-    edge, hair = np.ones(mask.shape, bool), capture.mask(camera)
-    edge[1:-1, 1:-1] = False
+    edge, hair = edges(mask), capture.mask(camera)
     if hair is not None:
         edge &= ~hair
     steps = [s for s in capture.of_kind("olat") if capture.has(s, camera)]
@@ -182,6 +196,13 @@ def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
         return kept
     labels, _ = ndimage.label(kept | hair, np.ones((3, 3)))
     return np.asarray(kept & np.isin(labels, np.unique(labels[hair])))
+
+
+def edges(mask: Bools) -> Bools:
+    """The outermost pixels of an image of the size of `mask (H, W)`."""
+    out = np.ones(mask.shape, bool)
+    out[1:-1, 1:-1] = False
+    return out
 
 
 def _fill_pinholes(mask: Bools) -> Bools:

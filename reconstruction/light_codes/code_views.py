@@ -16,7 +16,12 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import orientations
-from reconstruction.images.silhouettes import noise_of_frames
+from reconstruction.images.silhouettes import (
+    CONSTANT_LIGHT,
+    lit_frame,
+    noise_of_frames,
+    under_constant_light,
+)
 from reconstruction.light_codes.codes import CodeMap, along_lines, code_map
 from reconstruction.reconstruct_options import LogGaborBank
 from reconstruction.report.report import Progress, Stage, silent
@@ -83,22 +88,27 @@ def views_of(
 ) -> list[View]:
     """A view for each camera with hair on its mask `hair[name] (H, W)`.
 
-    Frames are scaled to equal irradiance at `subject (3,)`, metres. Raises `CaptureError` without
-    single-light frames, or if fewer than two cameras see hair under them.
+    Frames are scaled to equal irradiance at `subject (3,)`, metres. Under constant light lines come
+    from the fully lit frame and lightcodes are empty. Raises `CaptureError` without either frames,
+    or if fewer than two cameras see hair in them.
     """
     stage = stage or Stage("lightcodes")
     names = capture.olat_lights()
-    if not names:
-        raise CaptureError(f"{capture.path}: no OLAT frames, which lines and lightcodes come from")
+    constant = under_constant_light(capture)
+    if not names and not constant:
+        raise CaptureError(
+            f"{capture.path}: no OLAT or fully lit frames, which lines and lightcodes come from"
+        )
     cameras = [c for c in capture.rig.cameras if c.name in hair and hair[c.name].any()]
-    unlit = [c.name for c in cameras if not any(capture.has_light(n, c.name) for n in names)]
+    steps = capture.of_kind("all_on" if constant else "olat")
+    unlit = [c.name for c in cameras if not any(capture.has(s, c.name) for s in steps)]
     if unlit:
-        stage.warn(f"{', '.join(unlit)}: no frame of a single light; not used by line stereo")
+        stage.warn(f"{', '.join(unlit)}: no lit frame; not used by line stereo")
         cameras = [c for c in cameras if c.name not in unlit]
     if len(cameras) < 2:
         raise CaptureError(
             f"{capture.path}: hair is on the masks of {[c.name for c in cameras]}: line stereo "
-            "needs two cameras that see it under single lights; check the masks"
+            "needs two cameras that see it; check the masks"
         )
     views = []
     for done, camera in enumerate(cameras):
@@ -112,19 +122,21 @@ def views_of(
         threshold={v.camera.name: v.codes.threshold for v in views},
         confidence={v.camera.name: float(np.median(v.confidence[v.mask])) for v in views},
     )
-    if alone:
+    if constant:
+        stage.leave_out("lightcodes", CONSTANT_LIGHT, "visibility and agreement by shadows")
+    elif alone:
         stage.warn(
             f"no light is beside {alone}: their visibility comes from their position, not from "
             "lightcodes"
         )
-    if not any(v.codes.varying.any() for v in views):
+    if not constant and not any(v.codes.varying.any() for v in views):
         stage.warn(
             "all lightcodes are equal, so depths come from lines alone: add single lights that "
             "shadow parts of the hair"
         )
     if not any((v.confidence > 0).any() for v in views):
         raise CaptureError(
-            f"{capture.path}: no hair pixel has a direction: are the OLAT frames in focus and lit?"
+            f"{capture.path}: no hair pixel has a direction: are the frames in focus and lit?"
         )
     return views
 
@@ -137,6 +149,12 @@ def _view(
     subject: Any,
     bank: LogGaborBank,
 ) -> View:
+    if not names:
+        image, saturated = lit_frame(capture, camera.name)
+        one = grey(image)[None]
+        found = orientations(one, mask, bank, known=~saturated[None])
+        codes = code_map(one, mask, 0, noise_of_frames(one), shot=np.zeros(1, bool))
+        return View(camera, mask, line_vectors(found.angle, found.confidence), codes, -1)
     at = np.asarray(subject, float)
     lights = [capture.rig.light(n) for n in names]
     images = np.zeros((len(names), camera.height, camera.width), np.float32)

@@ -15,6 +15,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, textures
+from reconstruction.images.silhouettes import CONSTANT_LIGHT, lit_frame, under_constant_light
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
@@ -64,8 +65,11 @@ class Measured:
 def light_groups(lights: list[Light], count: int) -> Ints:
     """Group number `(L,)` of each light: nearest of `count` seeds.
 
-    Farthest-point seeds, then two rounds of k-means; no randomness.
+    Farthest-point seeds, then two rounds of k-means; no randomness. Without lights the group of one
+    fully lit frame.
     """
+    if not lights:
+        return np.zeros(1, np.int64)
     p = np.stack([light.position / np.linalg.norm(light.position) for light in lights])
     count = min(count, len(p))
     seeds = [0]
@@ -82,7 +86,13 @@ def light_groups(lights: list[Light], count: int) -> Ints:
 
 
 def read_olat(capture: Capture, camera: Camera, lights: Sequence[str]) -> OlatStack:
-    """The frames of `camera` under each of `lights`; missing or saturated pixels are unknown."""
+    """The frames of `camera` under each of `lights`; missing or saturated pixels are unknown.
+
+    Without lights, its fully lit frame.
+    """
+    if not lights:
+        image, saturated = lit_frame(capture, camera.name)
+        return OlatStack(camera, grey(image)[None], ~saturated[None])
     olat = np.zeros((len(lights), camera.height, camera.width), np.float32)
     known = np.zeros(olat.shape, bool)
     for i, name in enumerate(lights):
@@ -94,7 +104,7 @@ def read_olat(capture: Capture, camera: Camera, lights: Sequence[str]) -> OlatSt
 
 @dataclass
 class Saturation:
-    """Counts hair samples (pixels under single lights) and the saturated ones."""
+    """Counts hair samples (pixels under each light) and the saturated ones."""
 
     observed_count: int = 0
     saturated_count: int = 0
@@ -111,8 +121,7 @@ class Saturation:
         stage.figures["saturated"] = share
         if share > MOST_SATURATED:
             stage.warn(
-                f"{share:.0%} of the hair pixels under single lights are saturated and ignored: "
-                "add a shorter exposure to the plan"
+                f"{share:.0%} of the hair pixels are saturated and ignored: add a shorter exposure"
             )
 
 
@@ -128,13 +137,15 @@ def measure_tangents(
     """Directions at the triangulated `points (N, 3)`, or without any, at the depths'.
 
     `depths[camera] (H, W)` of the hair pixels are metres along z. Raises `CaptureError` for a
-    capture without OLAT frames.
+    capture without OLAT and fully lit frames.
     """
     stage = stage or Stage("orientation")
     capture = masked.capture
     names = capture.olat_lights()
-    if not names:
-        raise CaptureError(f"{capture.path}: no OLAT frames, which the orientations come from")
+    if not names and not under_constant_light(capture):
+        raise CaptureError(
+            f"{capture.path}: no OLAT or fully lit frames, which the orientations come from"
+        )
     lights = [capture.rig.light(n) for n in names]
     group = light_groups(lights, LIGHT_GROUPS)
     cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
@@ -172,7 +183,7 @@ def measure_tangents(
     if not reads:
         stage.leave_out(
             "directions from reflection",
-            f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}",
+            f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}" if lights else CONSTANT_LIGHT,
             "the second half of this stage; directions come from texture alone",
         )
     else:

@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     imported.add_argument(
         "--pictures",
         help="paths of the OLAT images: {camera}/{light}.png; default: import.toml's, or "
-        "images/{camera}/{light}.*",
+        "images/{camera}/{light}.*; without {light}: photographs under constant light",
     )
     imported.add_argument("--settings", type=Path, help="instead of the folder's import.toml")
     imported.add_argument(
@@ -166,7 +166,8 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     else:
         geometry = own_geometry(args.folder, files.placement, files)
     if args.pictures is not None:
-        patterns = replace(settings.pictures, olat=args.pictures)
+        role = "olat" if "{light}" in args.pictures or geometry.lights else "all_on"
+        patterns = replace(settings.pictures, **{role: args.pictures})
         settings = replace(settings, pictures=patterns)
     imported = Import.of(args.folder, geometry, settings)
     return imported, [*geometry.notes, *imported.found.notes]

@@ -3,7 +3,7 @@
 Each picture has its frame's number and its camera in black and white cells, whatever the curve.
 The layouts are those of the authors' own tools: FaceOLAT's README and relighting/, HumanOLAT's
 olat_explorer.py and train_tools.py, OpenIllumination's open_illumination.py and loader, EasyMocap's
-camera_utils.py, nersemble_data's constants.py, GaussianHaircut's run.sh and dataset_readers.py.
+camera_utils.py, nersemble_data's constants.py; GaussianHaircut's is in test_photographs.py.
 """
 
 from __future__ import annotations
@@ -227,17 +227,6 @@ def nersemble(root: Path) -> list[str]:
     return [str(root / "018")]
 
 
-def gaussian_haircut(root: Path) -> list[str]:
-    """A picture each from COLMAP's cameras, and Matte-Anything's masks."""
-    cameras = stage([f"{k:06d}" for k in range(1, 5)])
-    writers.write_colmap_binary(root / "sparse" / "0", cameras)
-    for camera in cameras:
-        put(root / "images" / f"{camera.name}.png", cells(0, 0))
-        for what in ("hair", "body", "face"):
-            put(root / "masks" / what / f"{camera.name}.png", cells(0, 0))
-    return [str(root)]
-
-
 def lighting_patterns(root: Path) -> list[str]:
     """OpenIllumination's other half: 13 patterns of many lamps, beside the lights' positions."""
     folder = root / "lighting_patterns" / "obj_20_greenhead"
@@ -249,8 +238,7 @@ def lighting_patterns(root: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("write", "said"),
     [
-        (nersemble, "cam_222200037.mp4: videos are not read: extract the frame of each light"),
-        (gaussian_haircut, "under constant light (NeRSemble, GaussianHaircut) cannot be used"),
+        (nersemble, "cam_222200037.mp4: videos are not read: extract its frames"),
         (lighting_patterns, "a pattern of many lamps, single lights are needed: download"),
     ],
 )
