@@ -127,6 +127,11 @@ class _Run:
             self.hull(masked, cloud, head or heads.fit_by_shading(masked))
         else:
             head = head or heads.fit_to_skin_points(masked, cloud)
+            if not capture.olat_lights():
+                raise CaptureError(
+                    f"{capture.path}: no OLAT frames, which the method '{method}' needs; 'hull' "
+                    "takes photographs under constant light"
+                )
             scale = measuring.scale(masked, cloud, head)
             envelope, depths = measuring.envelope(masked, cloud, head.mesh, scale)
             measured = measuring.tangents(masked, cloud, depths, scale)

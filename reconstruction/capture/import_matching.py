@@ -71,7 +71,9 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     """
     names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
     reader, needed = _Names(rig, settings), "olat" if rig.lights else "all_on"
-    patterns = settings.pictures if rig.lights else _of_photographs(settings.pictures, reader, names)
+    patterns = (
+        settings.pictures if rig.lights else _of_photographs(settings.pictures, reader, names)
+    )
     matches: dict[str, list[_Match]] = {}
     used: set[Path] = set()
     for role in (f for f in vars(patterns) if getattr(patterns, f)):
@@ -122,7 +124,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
 
 
 def _of_photographs(patterns: Patterns, reader: _Names, names: Mapping[str, Path]) -> Patterns:
-    """`patterns` for a set without lights: defaults become the first of `PHOTOGRAPHS` that match."""
+    """`patterns` of a set without lights: defaults become the first of `PHOTOGRAPHS` that match."""
     chosen = {}
     for role, places in PHOTOGRAPHS.items():
         if getattr(patterns, role) == getattr(Patterns(), role):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -273,8 +274,13 @@ def test_auto_with_a_head_and_with_nothing_but_masks(unswept: Capture, tmp_path:
     report = reconstruct(unswept, Model(tmp_path / "head"), method="auto", options=QUICK)
     assert report["method"].figures["capture_holds"] == "no sweep, 12 single lights, a head"
     runs_down(read_strands(tmp_path / "head" / "strands.npz"))
-    dark = Capture(unswept.path)
-    dark.steps = tuple(s for s in dark.steps if s.kind != "olat")
+    bare = shutil.copytree(unswept.path, tmp_path / "bare")
+    (bare / "masks").mkdir()
+    for camera in unswept.rig.cameras:
+        made = tmp_path / "head" / "masks" / f"{camera.name}_hair.png"
+        shutil.copy(made, bare / "masks" / f"{camera.name}.png")
+    dark = Capture(bare)
+    dark.steps = tuple(s for s in dark.steps if s.kind == "dark")
     report = reconstruct(dark, Model(tmp_path / "dark"), method="auto", options=QUICK)
     assert any("all strands are guessed" in w for w in report["line stereo"].warnings)
     estimated = estimate(dark, options=QUICK)
