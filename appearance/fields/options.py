@@ -62,14 +62,26 @@ class FieldRequest:
     """The options of a job.
 
     At most `lights` training lights and `pixels` of each camera's hair are used, `hits` rays a
-    pixel to find strands, and `spp` paths a pixel of at most `max_depth` vertices to render. "none"
-    fits no field and removes an earlier one.
+    pixel to find strands, and `spp` paths a pixel of at most `max_depth` vertices to render; None
+    is derived (`resolved`). "none" fits no field and removes an earlier one.
     """
 
     field: Literal["none", "modulation", "additive"] = "modulation"
-    lights: Count = 64
-    pixels: Count = 20_000
+    lights: Count | None = None
+    pixels: Count | None = None
     hits: Annotated[int, Field(ge=1, le=64)] = 8
-    spp: Count = 36
+    spp: Count = 16
     max_depth: Count = 16
     fit: FieldOptions = FieldOptions()
+
+    def resolved(self, cameras: int, strands: int) -> tuple[int, int]:
+        """`lights`, and `pixels` of each of `cameras`, with numbers for None.
+
+        A fold leaves out twice as many lights as there are harmonics of their directions: enough to
+        judge a field by. All cameras together have as many pixels at each of the finest anchors as
+        there are harmonics of the direction to a camera.
+        """
+        layers, columns, rows = self.fit.levels[-1]
+        anchors, harmonics = layers * (columns * rows or strands), (self.fit.degree + 1) ** 2
+        pixels = -(-harmonics * anchors // max(cameras, 1))
+        return self.lights or 2 * self.fit.folds * harmonics, self.pixels or pixels

@@ -60,14 +60,12 @@ def fit_field(
     if request.field == "none":
         raise ValueError("the field 'none' cannot be fitted")
     rng, folder = np.random.default_rng(seed), model.work("field")
-    pixels = {
-        c.name: chosen(model.mask(c.name, "hair", training), request.pixels, rng)
-        for c in training.rig.cameras
-    }
-    pixels = {name: index for name, index in pixels.items() if len(index)}
+    strands, cameras = len(rendered.mapped.root_uv), training.rig.cameras
+    _, most = request.resolved(len(cameras), strands)
+    masks = {c.name: model.mask(c.name, "hair", training) for c in cameras}
+    pixels = {name: chosen(mask, most, rng) for name, mask in masks.items() if mask.any()}
     if not pixels:
         raise ModelError(f"{model}: the hair masks of the training cameras are all empty")
-    strands = len(rendered.mapped.root_uv)
     needed = memory_needed(
         [len(p) for p in pixels.values()], len(rendered.lights), strands, request
     )
@@ -76,8 +74,8 @@ def fit_field(
     if free is not None and needed > free:
         raise ModelError(
             f"{model}: a field of {len(rendered.lights)} lights needs about {needed:.1f} GB of "
-            f"memory, {free:.1f} GB are free: lower the field's pixels ({request.pixels}), hits "
-            f"({request.hits}) or lights ({request.lights})"
+            f"memory, {free:.1f} GB are free: lower the field's pixels ({most}), hits "
+            f"({request.hits}) or lights ({len(rendered.lights)})"
         )
     views = []
     for i, (name, index) in enumerate(pixels.items()):

@@ -21,9 +21,11 @@ from reconstruction import Capture, Model
 from reconstruction.report.report import resident_memory
 
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
-_PATHS = {"sun": 2.7e6, "shared": 87.0, "spatial": 6e5, "correctives": 1.1e6, "field": 1.5}
+_PATHS = {"sun": 2.7e6, "shared": 87.0, "spatial": 6e5, "correctives": 1.1e6}
 """Paths of the stages, in paths of the probe: of sun, spatial and correctives in all; of shared for
-each of a patch's; of field for each that it renders."""
+each of a patch's."""
+_FIELD_DIRECT, _FIELD_LIGHT = 30.0, 2.3
+"""Of a field, a pixel's paths beside `spp`: of direct light, and for each light."""
 _JUDGED = 1 << 20
 """Paths of the held-out frames of a guess."""
 
@@ -60,14 +62,16 @@ def estimate_fit(
     views = min(SHARED_VIEWS, len(pixels)) * min(SHARED_LIGHTS, fitted)
     judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
     shared = _PATHS["shared"] * views * effort.pixels * effort.spp / SHARED_LIGHTS + judged
-    of_field, many = [min(n, field.pixels) for n in hair], min(lights, field.lights)
+    most_lights, most = field.resolved(len(hair), len(strands))
+    of_field, many = [min(n, most) for n in hair], min(lights, most_lights)
     paths = {
         "sun": _PATHS["sun"],
         "shared": shared,
         "spatial": _PATHS["spatial"] + shared,
         "correctives": _PATHS["correctives"] + judged,
         "lights": shared,
-        "field": _PATHS["field"] * sum(of_field) * field.spp * many / _PROBE_LIGHTS,
+        # every pixel of hair is rendered, for what is smooth
+        "field": sum(hair) * (field.spp + _FIELD_DIRECT + _FIELD_LIGHT * many),
     }
     material = memory_needed(Sizes(pixels, fitted, len(strands.points)), request.fit)
     memory = {"field": field_memory(of_field, many, len(strands), field)}

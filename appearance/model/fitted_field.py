@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ def fit_field_validated(
 ) -> dict[str, Any]:
     """Fit a field to the model's residual, kept by `decide` on left-out images.
 
-    Of the lights that are not `held_out`, `request.lights` are used, with directions far apart.
+    Of the lights that are not `held_out` some are used (`FieldRequest`), with directions far apart.
     Cameras and lights are left out in turn; an image decides if neither its camera nor its light
     was fitted. If the field is dropped, an earlier one stays. Writes `field.npz`, fitted to all
     frames, and the stage "field" of the report. Returns `{"stages": [decision], "rendered",
@@ -47,10 +47,12 @@ def fit_field_validated(
     training = held_out.training(capture)
     names = training.olat_lights()
     directions = np.array([training.rig.light(name).position for name in names])
-    used = [names[k] for k in far_apart(directions, request.lights)]
-    if not Folds.of(len(training.rig.cameras), len(used), request.fit.folds).count:
+    fitted, cameras = FittedModel.load(model, capture, with_field=False), training.rig.cameras
+    lights, pixels = request.resolved(len(cameras), len(fitted.strands))
+    used = [names[k] for k in far_apart(directions, lights)]
+    if not Folds.of(len(cameras), len(used), request.fit.folds).count:
         return {"stages": [Decision("field", skipped=NOTHING).to_dict()], "rendered": False}
-    fitted = FittedModel.load(model, capture, with_field=False)
+    request = replace(request, lights=len(used), pixels=pixels)
     with report.stage("field") as stage:
         mapped = fitted.mapped()
         base = Rendered(

@@ -38,11 +38,10 @@ FULL = DemoKind(
     "full",
     {
         "stages": ["sun", "shared", "spatial", "lights", "field"],
-        "fields": {"lights": 12, "pixels": 1500, "spp": 16},
         "assess": {"turning_frames": 36},
     },
     720.0,
-    {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"} | {"fields": 25.0},
+    {step: SECONDS[step] for step in PIPELINES["full"] if step != "compress"},
 )
 LIGHTS, PIXELS, ROWS, TRACKING_EVERY = 24, 80, 24, 24
 _SIZE = f"{LIGHTS} lights, {PIXELS} × {PIXELS} pixels"

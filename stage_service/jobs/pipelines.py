@@ -25,7 +25,7 @@ SECONDS = {
     "reconstruct": 166,
     "fit": 63,
     "inverse_rendering": 85,
-    "fields": 120,
+    "fields": 100,
     "relight": 80,
     "assess": 60,
     "evaluate": 148,

@@ -43,6 +43,7 @@ WORSE = Decision("field", 0.04, 0.05, 0.001)
 HAIR = HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3)
 REQUEST = FieldRequest(
     lights=12,
+    pixels=20_000,
     spp=1024,
     max_depth=2,
     fit=FieldOptions(degree=1, levels=((2, 3, 3),), ridges=(1e-3, 1e-2, 0.1)),
@@ -121,6 +122,14 @@ def test_a_field_that_helps_is_in_every_picture_of_the_model(made, kept):
         assert with_it[1] / without[1] == pytest.approx(1, rel=0.08)
     assert not model.work("field").exists()
     assert FittedModel.load(model, capture, with_field=False).field is None
+
+
+def test_lights_and_pixels_follow_from_the_unknowns():
+    """Four harmonics, twice in each of three folds, and at 8 x 32 x 32 anchors over the cameras."""
+    assert FieldRequest().resolved(8, 10_000) == (24, 4096)
+    assert FieldRequest().resolved(48, 10_000) == (24, 683)
+    on_strands = FieldOptions(levels=((2, 4, 4), (8, 0, 0)), degree=3)
+    assert FieldRequest(fit=on_strands, lights=7).resolved(10, 500) == (7, 6400)
 
 
 @pytest.mark.slow
