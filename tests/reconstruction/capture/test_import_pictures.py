@@ -531,6 +531,17 @@ def test_a_raw_file_is_light_between_its_black_and_white(tmp_path):
     assert not picture.saturated.any()
 
 
+def test_a_colour_matrix_of_raw_that_is_not_applied_is_named(folder):
+    grey = np.full((SIZE, SIZE), 3000, np.uint16)
+    for camera in CAMERAS:
+        (folder / "images" / camera).mkdir(parents=True)
+    everywhere(lambda c, n, x: write_dng(folder / f"images/{c}/{n}.dng", grey))
+    for text, noted in (("", 1), ("sensor.matrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n", 0)):
+        settings(folder, text)
+        notes = [n for n in Import.of(folder).found.notes if "ColorMatrix is not applied" in n]
+        assert len(notes) == noted
+
+
 @pytest.mark.parametrize(
     ("sensor", "says"),
     [
