@@ -49,7 +49,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     """Reconstruct strands from a capture.
 
     --method auto selects the method by the capture: planes of light if there is a sweep, else the
-    hull of the masks, filled along directions from OLAT frames.
+    hull of the masks, filled along directions from OLAT frames or photographs under constant light.
 
     Write MODEL/strands.npz, .hair and .usdc, MODEL/report.json and the page MODEL/index.html. With
     --estimate, print seconds, memory and disk by stage instead: frames and filters are timed for
