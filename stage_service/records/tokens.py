@@ -30,8 +30,6 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 WAIT_S = 0.5
 """Seconds that a request waits for the file's disk."""
-EVERY_S = 0.02
-"""Seconds between checks of the file, whose thread a busy service is slow to start."""
 
 
 class TokenError(ValueError):
@@ -59,7 +57,7 @@ class Entry(Identity):
 
 
 class Tokens:
-    """The tokens in `path`; changes by other processes apply within `EVERY_S`.
+    """The tokens in `path`; changes by other processes apply at once.
 
     `own` is one more, with every scope: that of the user who runs the service. An unreadable file
     grants nothing. While its disk hangs, the last content applies: a blackout waits for no disk.
@@ -69,9 +67,7 @@ class Tokens:
         self._path = path
         self._own = None if own is None else hashed(own)
         self._lock = threading.Lock()
-        self._file = PolledFile[dict[str, Identity]](
-            path, self._opened, {}, wait_s=WAIT_S, every_s=EVERY_S
-        )
+        self._file = PolledFile[dict[str, Identity]](path, self._opened, {}, wait_s=WAIT_S)
 
     def find(self, token: str) -> Identity | None:
         """The identity of a token."""
