@@ -22,6 +22,10 @@ AT_ONCE, AT_ONCE_PER_S = 40.0, 20.0
 """Connections of one caller who may steer that are admitted at once, and how many more a second. A
 browser opens 6."""
 
+CHECKED_S = 0.1
+"""Age of the tokens by which a connection is admitted; its requests are checked against new ones.
+A check takes a thread, which a busy interpreter is slow to start: too slow for 500 at once."""
+
 
 class Admission:
     """Judges connections. Requests that darken are admitted at once, and so are the first of a
@@ -38,7 +42,7 @@ class Admission:
         request = f"{method} {self._access.inner(path)}"
         stop = STOP.fullmatch(request)
         stops = stop is not None and stop[1] in (None, self._running())
-        identity = self._access.identity(headers)
+        identity = self._access.identity(headers, within_s=CHECKED_S)
         if identity is None and stops:
             identity = self._access.darkens(headers)
         owner = Owner.of(identity, (address, 0))

@@ -67,17 +67,22 @@ class Access:
                 return "foreign-origin", detail, None
         return None
 
-    def identity(self, headers: Headers, secure: bool = False) -> Identity | None:
-        """The caller, over TLS if `secure`. A token in the header takes precedence over cookies; of
-        several cookies the first valid one counts."""
+    def identity(
+        self, headers: Headers, secure: bool = False, within_s: float = 0.0
+    ) -> Identity | None:
+        """The caller, over TLS if `secure`, by tokens that were checked within the last `within_s`
+        seconds. A token in the header takes precedence over cookies; of several cookies the first
+        valid one counts."""
         if self.tokens is None:
             return ANYBODY
         if "authorization" in headers:
             kind, _, token = headers["authorization"].partition(" ")
-            return self.tokens.find(token.strip()) if kind.lower() == "bearer" else None
+            bearer = kind.lower() == "bearer"
+            return self.tokens.find(token.strip(), within_s) if bearer else None
         held = cookies(headers, secure, self.prefix)
         behind = self.logins.tokens_of(held, place(headers))
-        return next(filter(None, map(self.tokens.behind, behind)), None)
+        found = (self.tokens.behind(hash, within_s) for hash in behind)
+        return next(filter(None, found), None)
 
     def darkens(self, headers: Headers) -> Identity | None:
         """The identity of a page's blackout right, kept from an earlier login; reads no disk."""

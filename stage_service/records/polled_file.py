@@ -30,15 +30,20 @@ class PolledFile(Generic[T]):
         self._last: tuple[Version, T] = (None, first)
         self._polling = threading.Lock()
         self._pending: Future[T] | None = None
-        self._until = self._due = 0.0
+        self._until = self._due = self._begun = 0.0
 
     @property
     def value(self) -> T:
         """The newest value; raises no error of the disk."""
+        return self.checked(within_s=0.0)
+
+    def checked(self, within_s: float) -> T:
+        """The value; the file is checked if its last check began more than `within_s` ago."""
         with self._polling:
             now = time.monotonic()
-            if (self._pending is None or self._pending.done()) and now >= self._due:
-                self._pending = beside(self._poll, self._path.name)
+            due = max(self._due, self._begun + within_s)
+            if (self._pending is None or self._pending.done()) and now >= due:
+                self._pending, self._begun = beside(self._poll, self._path.name), now
                 self._until, self._due = now + self._wait_s, now + self._every_s
             pending, left = self._pending, max(0.0, self._until - now)
         if pending is None:
@@ -48,7 +53,7 @@ class PolledFile(Generic[T]):
     def changed(self) -> None:
         """Make the next reader wait for the file, which this process has just written."""
         with self._polling:
-            self._pending, self._due = None, 0.0
+            self._pending, self._due, self._begun = None, 0.0, 0.0
 
     def _poll(self) -> T:
         version = version_of(self._path)
