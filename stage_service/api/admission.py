@@ -21,7 +21,6 @@ from stage_service.web.headers import INERT
 AT_ONCE, AT_ONCE_PER_S = 40.0, 20.0
 """Connections of one caller who may steer that are admitted at once, and how many more a second. A
 browser opens 6."""
-
 CHECKED_S = 0.1
 """Age of the tokens by which a connection is admitted; its requests are checked against new ones.
 A check takes a thread, which a busy interpreter is slow to start: too slow for 500 at once."""
@@ -29,8 +28,9 @@ A check takes a thread, which a busy interpreter is slow to start: too slow for 
 
 class Admission:
     """Judges connections. Requests that darken are admitted at once, and so are the first of a
-    caller who may steer (`AT_ONCE`); others in turn while their owner has a place or needs none,
-    and the hall has room. `running()` is the id of the running capture."""
+    caller who may steer (`AT_ONCE`), if the caller has a place or the hall has room; others in
+    turn while their owner has a place or needs none, and the hall has room. `running()` is the id
+    of the running capture."""
 
     def __init__(self, access: Access, hall: Hall, running: Callable[[], str | None]) -> None:
         self._access, self._hall, self._running = access, hall, running
@@ -60,7 +60,7 @@ class Admission:
         left, since = self._left.get(owner, (AT_ONCE, now))
         left = min(AT_ONCE, left + AT_ONCE_PER_S * (now - since))
         self._left[owner] = max(left - 1, 0.0), now
-        return left >= 1 and not self._hall.crowded
+        return left >= 1 and (self._hall.lacks(owner) is None or not self._hall.crowded)
 
     def _refusal(self, owner: Owner, path: str) -> bytes:
         """A complete response, 429 or 503."""

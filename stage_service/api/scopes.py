@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import cast
 
 from starlette.routing import compile_path
@@ -96,6 +97,7 @@ def _routes() -> Iterator[tuple[re.Pattern[str], Route]]:
 ROUTES = tuple(_routes())
 
 
+@lru_cache(1024)
 def route_of(method: str, path: str) -> Route | None:
     """The route of a request; None if there is none."""
     method = "GET" if method == "HEAD" else method
