@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-PATIENCE_MS = 20_000
+PATIENCE_MS = 60_000
 
 
 class Pages:

@@ -471,6 +471,7 @@ def test_hair_far_from_the_scalp_is_kept_without_roots(tmp_path: Path) -> None:
     assert stages.report["roots"].left_out
 
 
+@pytest.mark.slow
 def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,7 @@ its volume is known.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -216,7 +216,12 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+def _fast(names: Iterable[str], *fast: str) -> list[Any]:
+    """All `names`, each but the `fast` ones as a slow test."""
+    return [n if n in fast else pytest.param(n, marks=pytest.mark.slow) for n in names]
+
+
+@pytest.mark.parametrize("name", _fast(BAD, "millimetres", "mirrored axes"))
 def test_a_world_that_cannot_be_is_refused_with_the_way_on(name: str, tmp_path: Path) -> None:
     change, said = BAD[name]
     world = World(**CHANGED.get(name, {}))
@@ -234,7 +239,7 @@ DOUBTED: dict[str, tuple[Callable[[World], None], dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", DOUBTED)
+@pytest.mark.parametrize("name", _fast(DOUBTED, "a second person"))
 def test_a_world_that_may_be_is_warned_of(name: str, tmp_path: Path) -> None:
     change, fields, said = DOUBTED[name]
     world = World(**fields)
@@ -277,7 +282,7 @@ def test_a_light_that_is_missing_is_named(tmp_path: Path, usual: Outcome) -> Non
     assert found.litres == pytest.approx(usual.litres, rel=1e-3)
 
 
-@pytest.mark.parametrize("wall", [0.03, 0.1])
+@pytest.mark.parametrize("wall", [0.03, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_a_lit_wall_is_no_part_of_the_head(wall: float, tmp_path: Path, usual: Outcome) -> None:
     found = outcome(replace(World(), wall=wall).write(tmp_path / "folder"))
     assert found.litres == pytest.approx(usual.litres, rel=0.03)

@@ -348,7 +348,7 @@ WALKS = {
         measured="--preset openillumination",
     ),
 }  # fmt: skip
-FAST = ("exr", "colmap")
+FAST = ("colmap",)
 
 
 def printed(start: str) -> str:

@@ -77,6 +77,7 @@ def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufte
     assert off(check(cut, HairMaps.of(START), quiet), tufted.truth) < 0.4
 
 
+@pytest.mark.slow
 def test_lights_at_a_third_of_the_distance(tufted):
     near = tufted.problem(views=1, lights=tufted.dome(8, 0.33))
     quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=32))

@@ -45,6 +45,7 @@ def test_no_frame_is_both_fitted_and_held_out(views, lights, held, counts):
     assert len(fitted | decide) == views * lights
 
 
+@pytest.mark.slow
 def test_the_errors_of_the_truth_are_zero_without_the_noise_of_few_paths(tufted):
     problem = tufted.problem(spp=4096)
     truth, effort = encode(HairMaps.of(tufted.truth)), Effort(spp=4, max_depth=6)

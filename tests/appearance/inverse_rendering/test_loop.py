@@ -62,10 +62,8 @@ def test_maps_are_kept_where_the_hair_has_two_colours(tufted, options):
     assert dark > 3 * light
 
 
-@pytest.mark.parametrize(
-    "killed_in",
-    ["absorption_of_cells", pytest.param("solve_correctives", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("killed_in", ["absorption_of_cells", "solve_correctives"])
 def test_an_interrupted_fit_does_not_begin_again(plain, options, tmp_path, monkeypatch, killed_in):
     stages = ("shared", "spatial", "correctives")
     whole = run(plain, START, stages=stages, options=options, seed=1)

@@ -107,6 +107,7 @@ def test_curve_and_black_level_are_recovered(
     assert len(found.notes) == 1
 
 
+@pytest.mark.slow
 def test_a_stated_curve_is_kept_and_contradicted(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -170,6 +170,7 @@ def test_sampling_is_within_its_error_and_repeats() -> None:
     assert compare_strands(pred, true, samples=500, seed=3)["all"]["1mm_10deg"] == some
 
 
+@pytest.mark.slow
 def test_any_number_of_blocks_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     true = curtain(spacing=1e-3)
     pred = moved(curtain(spacing=2e-3, tilt_deg=4), (0, 8e-4, 0))

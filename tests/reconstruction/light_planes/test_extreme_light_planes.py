@@ -106,6 +106,7 @@ def paint_masks(capture: Capture, pixels: Callable[[Camera], np.ndarray]) -> Non
         cv2.imwrite(str(capture.path / "masks" / f"{camera.name}.png"), image)
 
 
+@pytest.mark.slow
 def test_a_sweep_that_lights_nothing_is_done_without(stage: Shoot, tmp_path: Path) -> None:
     report = reconstruct(stage(brightness=0.0), Model(tmp_path), options=QUICK)
     finite(tmp_path, report)

@@ -46,6 +46,7 @@ def test_children_lie_within_the_spread_of_their_guide() -> None:
     assert np.median(away) == pytest.approx(1e-3 / np.sqrt(2), rel=0.05)  # of a filled disk
 
 
+@pytest.mark.slow
 def test_coarse_guides_become_smooth_curves() -> None:
     """A circle of 4 mm radius by eight points: children turn by degrees, not by 45."""
     a = np.linspace(0, 2 * np.pi, 9)
@@ -58,6 +59,7 @@ def test_coarse_guides_become_smooth_curves() -> None:
     assert turn.max() < 25  # a millimetre of the circle is 14 degrees
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
     one, again, other = (fine_groom(guides(6), CENTER, 0.01, seed=s) for s in (0, 0, 1))
     assert one.points.tobytes() == again.points.tobytes()

@@ -113,6 +113,7 @@ def fitted(made):
     return json.loads(printed.getvalue())
 
 
+@pytest.mark.slow
 def test_a_render_of_fitted_maps_is_nearer_to_a_held_out_frame(made, fitted, capsys):
     """Sun's fit leaves one material for all hair."""
     found = fitted

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from stage_service.cli.demo_screen import last_screen
@@ -46,8 +45,8 @@ RESULTS = {
 }
 
 
-def test_the_result_three_figures_with_their_best_baselines_and_what_to_open():
-    lines = last_screen(RESULTS, Path("runs/demo")).splitlines()
+def test_the_result_three_figures_with_their_best_baselines_and_what_to_open(tmp_path):
+    lines = last_screen(RESULTS, tmp_path).splitlines()
     assert "13,277 strands, 2,019 m; beta_m 0.32 (95 % interval 0.16 to 0.35), true 0.28" in lines
     figures = [line.split() for line in lines if line.startswith(("strands: F", "images: "))]
     assert [(row[-1], *row[-2:-1]) for row in figures] == [
@@ -66,9 +65,9 @@ def test_the_result_three_figures_with_their_best_baselines_and_what_to_open():
         assert path in text
 
 
-def test_it_has_at_most_25_lines_however_many_warnings_there_are():
+def test_it_has_at_most_25_lines_however_many_warnings_there_are(tmp_path):
     many = [f"masks: {n} pixels {'and others ' * 40}: check the poses" for n in range(30)]
-    lines = last_screen({**RESULTS, "warnings": many}, Path("runs/demo")).splitlines()
+    lines = last_screen({**RESULTS, "warnings": many}, tmp_path).splitlines()
     assert len(lines) <= 25
     assert any(line.startswith("Warnings to act on: 30") for line in lines)
 
@@ -79,8 +78,8 @@ def test_light_that_turns_is_named_if_there_is_any(tmp_path):
     assert "relit.webp: the hair under a turning" in last_screen(RESULTS, tmp_path)
 
 
-def test_a_quick_demo_is_labelled():
+def test_a_quick_demo_is_labelled(tmp_path):
     label = "quick demo: 24 lights; figures are not those of the full demo"
-    lines = last_screen({**RESULTS, "label": label}, Path("runs/demo")).splitlines()
+    lines = last_screen({**RESULTS, "label": label}, tmp_path).splitlines()
     assert lines[2] == label
-    assert label not in last_screen(RESULTS, Path("runs/demo"))
+    assert label not in last_screen(RESULTS, tmp_path)
