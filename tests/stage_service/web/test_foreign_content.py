@@ -72,7 +72,8 @@ def hostile(rig_file, tmp_path) -> Iterator[tuple[Client, str, str]]:
         http.headers["Authorization"] = "Bearer own"
         plan = {"lights": ["light_003"], "projectors": []}
         capture = http.post("/captures", json={"plan": plan}).json()["id"]
-        http.service._captures.wait(capture, 60)
+        shot = http.service._captures.wait(capture, 60)
+        assert shot.outcome == "completed", shot
         job_request = {"capture": capture, "pipeline": {"name": "reconstruct"}, "model": "m"}
         job = http.post("/jobs", json=job_request).json()["id"]
         model = Model(http.service.root / "models" / "m").create().path
