@@ -9,7 +9,6 @@ import numpy as np
 
 from reconstruction import Camera, Capture, CaptureError, Light, Model, ModelError
 from reconstruction.arrays import Array, Bools, Floats, Ints
-from reconstruction.images.silhouettes import under_constant_light
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class HeldOut:
         capture.view(cameras=self.cameras)  # raises for unknown names
         out = capture.without_lights(self.lights)
         cameras = [c.name for c in capture.rig.cameras if c.name not in self.cameras]
-        if under_constant_light(capture):
+        if capture.under_constant_light():
             raise CaptureError(
                 f"{capture.path}: photographs under constant light do not determine the hair's "
                 "appearance: capture an image under each of several lights of known position "

@@ -23,7 +23,6 @@ from reconstruction.head.capture_head import HeadPoints, digitised_points
 from reconstruction.head.lit_skin import FEWEST_LIGHTS as FEWEST_LIGHTS_OF_SKIN
 from reconstruction.head.lit_skin import MOST_LIGHTS
 from reconstruction.images.orientation import responses
-from reconstruction.images.silhouettes import under_constant_light
 from reconstruction.light_codes.codes import WORD
 from reconstruction.light_codes.line_strands import MOST_LINES
 from reconstruction.light_codes.search import STEP_PIXELS
@@ -134,12 +133,12 @@ class _Probe:
     @cached_property
     def lights(self) -> int:
         """Images of a camera that give directions: under single lights, else one fully lit."""
-        return len(self.capture.olat_lights()) or int(under_constant_light(self.capture))
+        return len(self.capture.olat_lights()) or int(self.capture.under_constant_light())
 
     @property
     def kind(self) -> StepKind:
         """The kind of these images."""
-        return "all_on" if under_constant_light(self.capture) else "olat"
+        return "all_on" if self.capture.under_constant_light() else "olat"
 
     @cached_property
     def slowness(self) -> float:

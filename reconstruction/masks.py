@@ -33,7 +33,6 @@ from reconstruction.images.silhouettes import (
     NoSilhouette,
     edges,
     silhouette,
-    under_constant_light,
 )
 from reconstruction.images.visual_hull import trim_edges, visual_hull
 from reconstruction.light_planes.point_cloud import PointCloud
@@ -105,7 +104,7 @@ def hair_masks(
     mask and the head. Raises `CaptureError` if one of them is missing.
     """
     geometry, masks, views = MaskGeometry.of(points, head), {}, []
-    constant = under_constant_light(capture)
+    constant = capture.under_constant_light()
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         if user is None and not any(capture.has(s, camera.name) for s in capture.steps):

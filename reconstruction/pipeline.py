@@ -19,7 +19,6 @@ from reconstruction.growth.hair_envelope import SHELL, build_hull
 from reconstruction.head.capture_head import FittedHead
 from reconstruction.head.heads import Heads
 from reconstruction.head.scalp import find_scalp
-from reconstruction.images.silhouettes import under_constant_light
 from reconstruction.light_codes.line_strands import SEGMENT_WEIGHT, merge, roots_first
 from reconstruction.light_planes import Motion, PointCloud
 from reconstruction.masks import MaskedCapture
@@ -170,7 +169,7 @@ class _Run:
         strand has a root.
         """
         o, capture, report = self.stages.options, masked.capture, self.stages.report
-        lit = bool(capture.olat_lights()) or under_constant_light(capture)
+        lit = bool(capture.olat_lights()) or capture.under_constant_light()
         mesh = None if head is None else head.mesh
         scale = self.measuring.scale(masked, cloud, head)
         if mesh is None:

@@ -16,7 +16,6 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.head.capture_head import FittedHead
-from reconstruction.images.silhouettes import under_constant_light
 from reconstruction.light_codes.line_strands import line_strands
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
@@ -85,7 +84,7 @@ class MeasuringStages(Stages):
             sweep, lights = bool(capture.of_kind("scanline")), len(capture.olat_lights())
             method = method_for(capture)
             holds = f"{'a' if sweep else 'no'} sweep, {lights} single lights, "
-            if under_constant_light(capture):
+            if capture.under_constant_light():
                 holds += f"{len(capture.rig.cameras)} photographs under constant light, "
             holds += f"{'no' if head is None else 'a'} head"
             stage.figures.update(method=method, capture_holds=holds)

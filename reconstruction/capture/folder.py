@@ -360,6 +360,10 @@ class Capture:
         """Names of the lights with single-light frames, in rig order."""
         return [light.name for light in self.rig.lights if light.name in self._of_light]
 
+    def under_constant_light(self) -> bool:
+        """Whether there are fully lit frames and none of single lights."""
+        return bool(self.of_kind("all_on")) and not self.olat_lights()
+
     def mask(self, camera: str) -> Bools | None:
         """The user's hair mask `(H, W)`, None without one."""
         return self._user_mask("masks", camera)

@@ -93,11 +93,6 @@ def _half_sample_mode(values: AnyFloats) -> float:
     return float(np.mean(values)) if len(values) else 0.0
 
 
-def under_constant_light(capture: Capture) -> bool:
-    """Whether the capture has fully lit frames and none of single lights."""
-    return bool(capture.of_kind("all_on")) and not capture.olat_lights()
-
-
 def lit_frame(capture: Capture, camera: str) -> tuple[Floats, Bools]:
     """`dark_response` of the camera's first fully lit frame; black and saturated without one."""
     for step in capture.of_kind("all_on"):

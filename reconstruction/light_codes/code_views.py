@@ -20,7 +20,6 @@ from reconstruction.images.silhouettes import (
     CONSTANT_LIGHT,
     lit_frame,
     noise_of_frames,
-    under_constant_light,
 )
 from reconstruction.light_codes.codes import CodeMap, along_lines, code_map
 from reconstruction.reconstruct_options import LogGaborBank
@@ -94,7 +93,7 @@ def views_of(
     """
     stage = stage or Stage("lightcodes")
     names = capture.olat_lights()
-    constant = under_constant_light(capture)
+    constant = capture.under_constant_light()
     if not names and not constant:
         raise CaptureError(
             f"{capture.path}: no OLAT or fully lit frames, which lines and lightcodes come from"

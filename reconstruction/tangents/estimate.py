@@ -15,7 +15,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, textures
-from reconstruction.images.silhouettes import CONSTANT_LIGHT, lit_frame, under_constant_light
+from reconstruction.images.silhouettes import CONSTANT_LIGHT, lit_frame
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
@@ -142,7 +142,7 @@ def measure_tangents(
     stage = stage or Stage("orientation")
     capture = masked.capture
     names = capture.olat_lights()
-    if not names and not under_constant_light(capture):
+    if not names and not capture.under_constant_light():
         raise CaptureError(
             f"{capture.path}: no OLAT or fully lit frames, which the orientations come from"
         )

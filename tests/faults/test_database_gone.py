@@ -42,6 +42,6 @@ def test_a_database_that_is_gone_fills_no_log(process, simulated, serve, postgre
         postgresql.start()
     assert 503 in answers
     assert answers <= {200, 503}
-    for new in lines:  # two minutes have begun, for at most three causes
-        assert 1 <= len(new) <= 6, new
+    for new in lines:  # two minutes have begun, for at most two causes
+        assert 1 <= len(new) <= 4, new
     until(lambda: client.get("/jobs").status_code == 200)

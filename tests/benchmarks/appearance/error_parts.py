@@ -38,7 +38,7 @@ GROUPS = ("held-out lights", "held-out camera")
 NEAR = 2.0
 """Greatest distance of a matched pair: pixels, and per 30° of direction one more."""
 MOST_PIECES = 800_000
-"""Of one scene: more segments than 2^20 cannot be told apart in Mitsuba's float32 coordinate."""
+"""In a scene: the float32 index of a segment on Mitsuba's curves is inexact above about 2^20."""
 _ROUNDS = 12
 
 

@@ -278,6 +278,17 @@ def test_tokens_that_are_made_at_the_same_time_are_all_there(tmp_path):
     assert len(Tokens(tmp_path / "tokens.json").entries()) == 30
 
 
+def test_only_a_check_that_may_be_old_misses_a_revoked_token(tmp_path):
+    """Connections are admitted by an old check, their requests by a new one."""
+    elsewhere = Tokens(tmp_path / "tokens.json")
+    token, here = elsewhere.make("ada", ("read",)), Tokens(tmp_path / "tokens.json")
+    assert here.find(token) is not None
+    elsewhere.revoke("ada")
+    assert here.find(token, within_s=3600) is not None
+    assert here.find(token) is None
+    assert here.find(token, within_s=3600) is None
+
+
 def test_a_browser_that_logs_in_needs_no_token_any_more(call, tokens, service):
     token = tokens.make("ada", ("read", "steer"))
     refused(call("POST /login", json={"token": "guessed"}), "unauthorized", 401)

@@ -22,6 +22,7 @@ from stage_service.api import bodies, connections, porch, throttle
 from stage_service.api.admission import AT_ONCE, Admission
 from stage_service.api.gate import Access
 from stage_service.api.places import LIMITS, Kind, NoPlace, Owner, Places
+from stage_service.api.porch import Verdict
 from stage_service.api.throttle import Throttle, Throttled
 from stage_service.records.tokens import Scope, Tokens
 
@@ -382,3 +383,25 @@ def test_a_flood_of_those_who_steer_waits_in_turn_but_for_blackouts(tmp_path: An
     assert at_once("POST /devices/blackout", "ada")
     assert at_once("GET /health", "bob")
     assert not at_once("GET /health", "")
+
+
+def test_a_crowd_does_not_keep_out_who_steers_and_has_a_place(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokens, places = Tokens(tmp_path / "tokens.json"), Places()
+    known = {who: tokens.make(who, ("read", who)) for who in ("steer", "jobs")}
+    admission = Admission(Access(tokens), connections.Hall(places), lambda: None)
+    monkeypatch.setattr(connections.Hall, "crowded", True)
+
+    def judged(who: str) -> Verdict:
+        own = f"Authorization: Bearer {known[who]}"
+        head = f"GET /captures HTTP/1.1\r\nHost: localhost\r\n{own}\r\n\r\n"
+        return admission.judge(head.encode(), "127.0.0.1")
+
+    assert judged("steer").at_once
+    assert not judged("jobs").at_once
+    assert not judged("jobs").may()
+    owner = Owner("steer", steers=True)
+    while places.lacks("connections", owner) is None:
+        places.take("connections", owner)
+    assert not judged("steer").at_once

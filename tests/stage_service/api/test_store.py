@@ -10,6 +10,7 @@ import socket
 import tarfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from serving import Client, serving, slug
 from waiting import until
 
 from reconstruction import Capture, Model, verify
+from stage_service import storage
 from stage_service.acquisition.states import CaptureStatus
 from stage_service.api import bodies
 from stage_service.api.gate import Access
@@ -181,6 +183,25 @@ def test_a_key_belongs_to_one_caller_and_one_request(rig_file, world, tmp_path):
         hers = http.post("/jobs", json={**requested, "model": "c"}, headers={**eve, **key})
         assert hers.status_code == 202
         assert hers.json()["id"] != first
+
+
+def test_archives_are_listed_one_at_a_time(rig_file, tmp_path, monkeypatch):
+    root, inside, together = tmp_path / "root", [], []
+    Model(root / "models" / "m").create().write_json("results.json", {})
+    listed = storage.files_of
+
+    def files_of(what: str, folder: Path) -> dict[str, Path]:
+        inside.append(what)
+        time.sleep(0.05)
+        together.append(len(inside))
+        inside.remove(what)
+        return listed(what, folder)
+
+    monkeypatch.setattr("stage_service.api.store.files_of", files_of)
+    with serving(rig_file, root) as http, ThreadPoolExecutor(6) as pool:
+        got = pool.map(lambda _: http.get("/models/m/archive.tar").status_code, range(6))
+        assert list(got) == 6 * [200]
+    assert together == 6 * [1]
 
 
 def test_removal_needs_its_scopes(rig_file, world, tmp_path):
