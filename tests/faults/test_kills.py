@@ -23,10 +23,12 @@ from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import resolve
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+FAST = ("a lamp lit", "a scanline shown", "reading frames", "after the journal", "a table running")
+KILLS = [pytest.param(*p, id=p[0], marks=() if p[0] in FAST else pytest.mark.slow) for p in PLACES]
 PLAN = {"lights": [f"light_{i:03d}" for i in range(10)], "rows": {"last": 9}}
 
 
-@pytest.mark.parametrize(("name", "place", "call", "stepping"), PLACES, ids=[p[0] for p in PLACES])
+@pytest.mark.parametrize(("name", "place", "call", "stepping"), KILLS)
 def test_sigkill_of_the_service(name, place, call, stepping, simulated, slack, tmp_path, add_row):
     rig_file, world = simulated()
     plan = CapturePlan(**PLAN, stepping=stepping)

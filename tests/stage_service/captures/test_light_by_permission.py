@@ -44,6 +44,7 @@ from stage_service.captures.capture_queue import CaptureQueue, UnknownEntry
 from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Caller
 from stage_service.config import LightRegisters, RigFile, SafetyLimits
+from stage_service.devices.cameras import link
 from stage_service.jobs.follower import JobFollower
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.resolved import PlanError
@@ -689,6 +690,7 @@ def run(
 ) -> Counter[str]:
     """What was done, in so many examples of so many steps."""
     monkeypatch.setattr(capture_queue, "POLL_S", 0.01)
+    monkeypatch.setattr(link, "POLL_S", (0.001, 0.01))
     monkeypatch.setattr(JobFollower, "start", lambda _self: None)
     looks: Counter[CaptureQueue] = Counter()
     for name in ("_begin_the_next", "_save"):  # which keeps it from beginning where it fails
