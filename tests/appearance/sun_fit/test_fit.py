@@ -69,7 +69,7 @@ def made(tmp_path_factory):
     model = Model(folder / "model").create()
     model.write_strands(strands)
     for camera in cameras:
-        images = render_olat(scene, camera, lights, spp=256, deep_lights=16, seed=7)
+        images = render_olat(scene, camera, lights, spp=64, deep_lights=16, seed=7)
         for step, image in zip(steps, images, strict=True):
             writer.write_frame(step, camera.name, 0.5 * image)
         share = coverage(scene, camera)
