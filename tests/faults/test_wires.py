@@ -122,10 +122,15 @@ CASES += [
 RTU = '[devices.lights]\nkind = "modbus_rtu"\nport = "lights"'
 
 
+def marks(one: Case, link: str) -> list[pytest.MarkDecorator]:
+    """The contracts of light banks have each fault of the second wire as well."""
+    return [] if link == one.links[0] else [pytest.mark.slow]
+
+
 @pytest.mark.parametrize(
     ("one", "stepping", "link"),
     [
-        pytest.param(c, s, k, id=f"{c.name}, {s}, {k}")
+        pytest.param(c, s, k, id=f"{c.name}, {s}, {k}", marks=marks(c, k))
         for c in CASES
         for s in c.stepping
         for k in c.links
