@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -190,16 +189,6 @@ def test_an_estimate_reports_the_stages_that_take_time(
     )
 
 
-def test_more_of_everything_is_estimated_to_take_more(unswept: Capture) -> None:
-    def cost(capture: Capture, **cost_options: Any) -> tuple[float, float]:
-        estimated = {s.name: s for s in estimate(capture, **cost_options).stages}
-        return estimated["orientation"].peak_gb, estimated["strands"].peak_gb
-
-    whole = cost(unswept)
-    assert all(np.array(whole) > cost(unswept.view(reduced=3)))
-    assert all(np.array(whole) > cost(unswept, options=ReconstructOptions(held_out=("c0", "c72"))))
-
-
 @pytest.mark.slow
 def test_lenses_that_bend_lines_give_the_same_strands(
     shoot: Callable[..., Capture],
@@ -221,28 +210,6 @@ def test_lenses_that_bend_lines_give_the_same_strands(
     image = cv2.imread(str(tmp_path / "masks" / f"{around[0].name}_hair.png"), 0)
     assert image is not None
     assert image.shape == (96, 96)
-
-
-def test_the_report_says_what_was_left_out(model: tuple[Path, Report]) -> None:
-    report = model[1]
-    assert [s.name for s in report.stages] == [
-        "triangulation",
-        "masks",
-        "scale",
-        "envelope",
-        "orientation",
-        "surface",
-        "field",
-        "strands",
-        "refinement",
-        "roots",
-    ]
-    assert [x.why for x in report["triangulation"].left_out] == ["the rig has no projector"]
-    assert any("12 lights" in x.why for x in report["orientation"].left_out)
-    (series,) = report["field"].series
-    assert series.name == "multigrid conjugate gradients"
-    # between a ball and a head a tenth smaller: 1.1 litres, and the hull's corners
-    assert 1.0 < report["envelope"].figures["envelope_litres"] < 2.0
 
 
 def test_auto_without_head_or_sweep_fills_the_hull_along_what_is_measured(
@@ -347,16 +314,6 @@ def test_a_capture_without_a_head_stands_on_digitised_scalp_points(
     report = reconstruct(Capture(capture.path), Model(tmp_path / "model"), options=COARSE)
     assert "head" not in [s.name for s in report.stages]
     assert not (tmp_path / "model" / "head.obj").exists()
-
-
-@pytest.mark.slow
-def test_a_missing_sweep_gives_a_warning(
-    shoot: Callable[..., Capture], around: list[Camera], tmp_path: Path
-) -> None:
-    capture = shoot(cameras=around[:3], sweep=False, lights=LIGHTS[:4], extra=hair)
-    write_obj(capture.path / "head.obj", ball(HEAD))
-    report = reconstruct(capture, Model(tmp_path), options=COARSE)
-    assert [x.why for x in report["triangulation"].left_out] == ["no sweep was captured"]
 
 
 def test_missing_inputs_raise_errors_that_name_them(

@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from stage_service.records import logs
-from stage_service.records.logs import EVERY_S, MOST_CAUSES, Causes, Folded
+from stage_service.records.logs import MOST_CAUSES, Causes, Folded
 
 log = logging.getLogger("hairstage.tests")
 
@@ -45,23 +45,6 @@ def test_a_cause_that_lasts_is_a_line_a_minute_with_its_count(causes, now, lines
         "camera 3: no answer at 120 (60 times, and for 120 s now)",
         "the disk: over after 149 s (it came 150 times)",
     ]
-
-
-def test_a_cause_that_comes_and_goes_is_no_more_lines_than_one_that_lasts(causes, now, lines):
-    for second in range(600):
-        now[0] = 1000.0 + second
-        causes.failed(log, "the disk", "no space left")
-        causes.over(log, "the disk")
-    assert len(lines()) <= 2 * 600 / EVERY_S + 2
-
-
-def test_a_second_run_after_more_than_a_minute_is_logged_again(causes, now, lines):
-    for start in (1000.0, 5000.0):
-        now[0] = start
-        causes.failed(log, "the disk", "no space left")
-        now[0] += 2
-        causes.over(log, "the disk")
-    assert lines() == 2 * ["the disk: no space left", "the disk: over after 2 s (it came 1 times)"]
 
 
 def test_causes_without_end_are_not_kept(causes):

@@ -13,7 +13,6 @@ from reconstruction import Mesh, Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
 from stage_service.model_page import model_page, write_page
-from stage_service.model_page.html import flat, number, size
 from stage_service.model_page.plots import error_plots
 
 EVIL = "<img src=x onerror=alert(1)> & \"'"
@@ -97,14 +96,6 @@ def test_everything_that_is_known_stands_on_the_page(model):
     assert text.count("<img src=x onerror=alert(1)>") >= 5  # as text
 
 
-def test_a_label_stands_under_the_name_before_and_after_there_are_results(model):
-    label = f"quick demo: 24 lights {EVIL}"
-    assert label not in Page(model_page(model)).text
-    assert label in Page(model_page(model, label)).text
-    model.write_json("results.json", {**model.json("results.json"), "label": label})
-    assert label in Page(model_page(model)).text
-
-
 def test_commands_name_the_model_also_where_the_page_is_made_in_it(model, monkeypatch, capsys):
     monkeypatch.chdir(model.path)
     assert main(["page", "."]) == 0
@@ -163,15 +154,6 @@ def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
     assert svg.attrib["aria-label"].startswith("growth of strands: <img")
 
 
-def test_an_error_of_a_logarithm_is_a_share(model):
-    results = model.json("results.json")
-    fitted = {"beta_m": 0.33, "beta_m_error": 0.068, "sigma_a_error": [0.02, None, 0.1]}
-    model.write_json("results.json", {**results, "appearance": {"fitted": fitted}})
-    text = Page(model_page(model)).text
-    assert "beta m error± 6.8%" in text
-    assert "± 2.0%, unknown, ± 10.0%" in text
-
-
 def test_rendered_and_missing_fits_are_listed_separately(model):
     report = model.report()
     with report.stage("inverse_rendering"):
@@ -205,31 +187,3 @@ def test_a_page_does_not_outlive_what_it_is_of(model):
     assert "index.html" in model.artifacts()
     model.write_strands(model.strands())
     assert not page.exists()
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        *((3, "3"), (1234567, "1,234,567"), (0.123456, "0.1235"), (2.5e-7, "2.5 · 10⁻⁷")),
-        *((1e-4, "10⁻⁴"), (True, "yes"), (None, "unknown"), (12345.6, "12,346"), (0.0, "0")),
-    ],
-)
-def test_numbers_read_well(value, text):
-    assert number(value) == text
-
-
-def test_figures_of_any_depth_become_rows():
-    figures = {"a": {"b_c": {"x": 1, "y": None}, "d": [1, 2]}, "e": [{"f": 1}]}
-    assert list(flat(figures)) == [
-        ("a · b c", "x 1, y unknown"),
-        ("a · d", "1, 2"),
-        ("e", "1 entries in report.json"),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("count", "text"),
-    [(0, "0 B"), (999, "999 B"), (1000, "1 kB"), (999_400, "999 kB"), (999_999, "1 MB")],
-)
-def test_sizes_read_well(count, text):
-    assert size(count) == text

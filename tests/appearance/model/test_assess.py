@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from appearance import Exposure, HairAppearance, HeldOut, Sampling, assess, build_scene, render_olat
-from appearance.metrics.pictures import comparison_picture
 from appearance.model import assess as assessment
 from appearance.model import baselines
 from appearance.model.assess import front_lights, judge
@@ -25,12 +24,10 @@ from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
     Camera,
     Capture,
-    CaptureError,
     CaptureWriter,
     Light,
     Mesh,
     Model,
-    ModelError,
     Rig,
     Stage,
     Step,
@@ -135,30 +132,6 @@ def test_a_baseline_that_is_not_beaten_is_warned_of():
         "diffuse is not beaten in psnr: 20 dB against its 20",
         "diffuse is not beaten in ssim: 0.5 against its 0.5",
     ]
-
-
-def test_invalid_held_out_names_are_refused_with_the_available_ones(made):
-    capture, *_ = made
-    lights, cameras = capture.olat_lights(), tuple(c.name for c in capture.rig.cameras)
-    with pytest.raises(CaptureError, match=f"no light nope; its {len(lights)} are {lights[0]}, "):
-        HeldOut((), ("nope",)).training(capture)
-    with pytest.raises(CaptureError, match="every camera is held out"):
-        HeldOut(cameras).training(capture)
-
-
-def test_a_black_frame_is_not_compared(made, quick, monkeypatch):
-    capture, model, _ = made
-    right = Capture.light
-
-    def light(self, name, camera):
-        image, saturated = right(self, name, camera)
-        return image * (name != "l4"), saturated
-
-    monkeypatch.setattr(Capture, "light", light)
-    found = assess(capture, model, held_out=HeldOut((), ("l4", "l9")), options=quick)
-    assert "held_out_camera" not in found
-    assert np.isfinite(found["held_out_lights"]["ours"]["relative_error"])
-    assert "cam_0, l4: the hair is black" in " ".join(model.report()["images"].warnings)
 
 
 def test_if_every_held_out_frame_is_black_nothing_is_compared(made, quick, tmp_path, monkeypatch):
@@ -329,15 +302,6 @@ def test_guided_frames_of_a_captured_light_are_its_own(guided):
     np.testing.assert_allclose(together[guided.mask], 4 * frame[guided.mask], 1e-3, 1e-9)
 
 
-def test_guided_frames_say_what_is_missing(guided):
-    base, light = np.zeros((*guided.mask.shape, 3)), guided.capture.rig.light("l0")
-    with pytest.raises(ModelError, match="cam_0: its hair mask is empty"):
-        replace(guided, mask=np.zeros_like(guided.mask))(base, [light])
-    alone = guided.capture.view(lights=[])
-    with pytest.raises(ModelError, match="cam_0: the capture has no frame of it"):
-        replace(guided, capture=alone)(base, [light])
-
-
 def test_a_saturated_pixel_is_mixed_of_the_lights_that_do_not_saturate_it(tmp_path):
     """Three equal lights about a fourth; under one of them a pixel is at full scale."""
     cameras = tuple(
@@ -499,8 +463,3 @@ def test_sparse_hair_and_a_black_room_are_relit(small, tmp_path, strands, level)
     shown = cv2.imread(str(model.file("relit.png")))
     assert (image.max() > 0) == (level > 0)
     assert (shown.max() == 255) == (level > 0)
-
-
-def test_no_held_out_frames_raise_an_error(tmp_path):
-    with pytest.raises(ValueError, match="held out"):
-        comparison_picture(tmp_path / "x.png", [], ("captured",))

@@ -95,21 +95,6 @@ def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     assert appearance.v == pytest.approx(float(variance_of_roughness(appearance.hair.beta_m)))
 
 
-def test_fit_reports_what_it_did(made, fitted):
-    _, report = fitted
-    assert [s.name for s in report.stages[-3:]] == ["samples", "roughness", "colour"]
-    samples = report["samples"]
-    assert samples.figures["cameras"] == 2
-    assert samples.figures["lights"] == 40
-    dark = [x for x in samples.left_out if "reach no hair" in x.why]
-    assert len(dark) == 1
-    assert "dark" in dark[0].what
-    assert sum("hair albedo is relative" in w for w in report["colour"].warnings) == 1
-    errors = [e for _, e in report["colour"].series[0].points]
-    assert min(errors) < 0.05
-    assert made[1].report().to_dict() == report.to_dict()
-
-
 def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path, monkeypatch):
     monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 1)
     capture, model = made

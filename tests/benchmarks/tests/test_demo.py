@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from benchmarks.demo import demo_columns, figures_of, markdown_table
 
-from stage_service.cli.support.commands import CommandError
-
 
 def strands(f: float) -> dict[str, Any]:
     return {over: {"1mm_10deg": {"f": f}} for over in ("visible", "all")}
@@ -55,24 +53,3 @@ def test_seeds_of_a_subject_are_a_mean_with_its_spread(columns):
     assert rows[-1] == "[1] fit: the roughness is at its bound, 3 (seed 3, 4)"
     (spread,) = figures_of(found["curly, seeds 3, 4"])["β_M to render these strands with"]
     assert spread == pytest.approx({"mean": 0.587, "std": 0.3 * 2**0.5, "n": 2})
-
-
-def test_subjects_and_runs_of_one_seed_have_columns_of_their_own(columns):
-    assert len(columns(results(), results())) == 2
-    found = columns(results(subject="a/lee.npz"), results(subject="b/kim.tfx"))
-    assert list(found) == ["lee, seed 3", "kim, seed 3"]
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        (json.dumps({"seed": 1}), "has no subject"),
-        (json.dumps(results(geometry={})), "has no 'visible'"),
-        (json.dumps(results(geometry=3)), "a figure of another kind"),
-        ("[]", "not a JSON object"),
-        ("{", "not JSON"),
-    ],
-)
-def test_a_file_that_is_no_demos_is_named(columns, text, why):
-    with pytest.raises(CommandError, match=rf"0\.json.*{why}"):
-        columns(text)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from simulators.frames.responses import Response
-from simulators.peers.faults import Fault
 
 BLACK, GAIN, EXPOSURE = 64, 50_000, 0.01
 
@@ -32,18 +31,6 @@ def pulse(bench):
 def lit(image):
     """Mean counts of the pixels that see the subject in `Known`."""
     return image.reshape(-1, 3)[:100].mean()
-
-
-def test_hello_describes_the_camera(bench):
-    reply = bench.camera("cam_b").send(op="hello", camera="cam_b")
-    assert reply == {
-        "ok": True,
-        "width": 16,
-        "height": 16,
-        "full_scale": 4095,
-        "black": BLACK,
-        "gain": GAIN,
-    }
 
 
 def test_a_lamp_that_was_never_on_makes_a_dark_frame(bench):
@@ -75,14 +62,6 @@ def test_the_state_at_the_pulse_counts_not_the_state_at_the_reading(bench):
     pulse(bench)
     bench.select(65535)
     assert lit(camera.frame()) == pytest.approx(expected(0.1), rel=0.03)
-
-
-def test_lamps_that_the_watchdog_put_off_make_dark_frames(bench):
-    camera = armed(bench)
-    bench.select(65535)
-    bench.now[0] += 2.01
-    pulse(bench)
-    assert lit(camera.frame()) == pytest.approx(BLACK, abs=0.5)
 
 
 def test_saturation_and_exposure(bench):
@@ -121,29 +100,6 @@ def test_arming_empties_the_queue_and_disarming_stops_frames(bench):
     pulse(bench)
     assert camera.read()["status"] == "frame"
     assert camera.read()["status"] == "empty"
-
-
-def test_a_dropped_frame_is_missing_once_and_on_one_camera(start):
-    bench = start(Fault("camera", "drop", 2, "cam_a"))
-    a, b = armed(bench), armed(bench, "cam_b")
-    for _ in range(3):
-        pulse(bench)
-    assert [a.read().get("block_id") for _ in range(3)] == [1, 2, None]
-    assert [b.read().get("block_id") for _ in range(3)] == [1, 2, 3]
-    bench.trigger.send("RESET")
-    for _ in range(2):
-        pulse(bench)
-    assert [a.read()["block_id"] for _ in range(2)] == [3, 4]
-
-
-def test_a_mute_camera_leaves_the_other_alone(start):
-    bench = start(Fault("camera", "mute", 1, "cam_a"))
-    a, b = armed(bench), armed(bench, "cam_b")
-    pulse(bench)
-    a.socket.settimeout(0.2)
-    with pytest.raises(TimeoutError):
-        a.send(op="read")
-    assert b.read()["status"] == "frame"
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from pymodbus.client import ModbusTcpClient
-from pymodbus.exceptions import ModbusIOException
 
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import Lamps
@@ -18,19 +16,6 @@ def status(bench):
 
 def coils(bench):
     return bench.lights.read_coils(0, count=5).bits[:5]
-
-
-def test_selector_lights_exactly_one_lamp(bench):
-    bench.select(2)
-    assert coils(bench) == [False, True, False, False, False]
-    bench.select(5)
-    assert coils(bench) == [False, False, False, False, True]
-    assert status(bench)[:2] == [0b1000, 1]
-    bench.select(65535)
-    assert status(bench)[1] == 5
-    assert bench.lights.read_holding_registers(1000).registers == [65535]
-    bench.select(0)
-    assert coils(bench) == [False] * 5
 
 
 def test_coils_one_by_one_and_together(bench):
@@ -76,16 +61,6 @@ def test_watchdog_puts_lamps_off_until_commanded_again(bench):
     assert status(bench)[:2] == [0b1000, 1]
 
 
-def test_heartbeats_keep_lamps_on_over_a_reconnection(bench):
-    bench.select(65535)
-    for _ in range(5):
-        bench.now[0] += 1.5
-        bench.lights.write_register(1001, 1)
-    bench.lights.close()
-    assert bench.lights.connect()
-    assert status(bench)[1] == 5
-
-
 def test_time_in_the_dark_does_not_count(bench):
     bench.now[0] += 3600
     bench.select(1)
@@ -99,20 +74,6 @@ def test_interlock_cuts_the_lamps(start):
     assert status(bench)[:2] == [0b0010, 0]
     bench.select(65535)
     assert status(bench)[1] == 0
-
-
-def test_hanging_bank_sends_no_reply_but_its_watchdog_runs(start):
-    bench = start(Fault("lights", "hang", 1))
-    bench.select(65535)
-    bench.trigger.send("PULSE 1000")
-    wires = bench.wires["lights"]
-    client = ModbusTcpClient(wires["host"], port=wires["port"], timeout=0.2, retries=0)
-    assert client.connect()
-    with pytest.raises(ModbusIOException):
-        client.read_input_registers(0)
-    client.close()
-    bench.now[0] += 2.01
-    assert not bench.world.lamps.power().any()
 
 
 @pytest.mark.parametrize("count", [0, 1001])

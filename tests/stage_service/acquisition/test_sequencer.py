@@ -201,21 +201,6 @@ def test_lamps_that_go_off_in_mid_exposure_leave_no_dark_frame(rig_file, world, 
     assert max(step for step, _ in Capture(tmp_path / "c").records) == 1
 
 
-def test_lamps_that_stay_lit_are_unknown_and_unsafe(rig_file, world, tmp_path):
-    events: list[Any] = []
-    run = sequencer(rig_file, tmp_path / "c", events)
-
-    def stick(_kind: str, data: dict[str, Any]) -> None:
-        world.stuck_lamps = world.stuck_lamps or data.get("light") == LIGHTS[0]
-
-    run._notify = stick
-    world.lit = set()
-    assert run.run() == "failed"
-    assert run.blackout is not None
-    assert not run.blackout.safe
-    assert "unknown, unsafe" in str(run.error)
-
-
 def test_pause_is_dark_and_resume_continues(rig_file, world, tmp_path):
     observed: list[tuple[bool, int]] = []
     run = sequencer(rig_file, tmp_path / "c")

@@ -198,14 +198,6 @@ def test_steering_a_capture(http, world):
     problem(submit, "unknown-capture")
 
 
-def test_devices_and_blackout(http, world):
-    devices = http.get("/devices").json()
-    assert devices["lights"]["state"] == "ok"
-    world.lit = {5}
-    assert http.post("/devices/blackout").json()["safe"] is True
-    assert not world.lit
-
-
 def snapshot(http: httpx.Client) -> dict[str, Any]:
     taken: dict[str, Any] = http.get("/captures/snapshot").json()
     return taken

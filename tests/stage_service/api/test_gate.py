@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import dataclasses
 import json
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -15,16 +14,13 @@ import httpx
 import pytest
 from serving import URL, refused, send, serving
 
-from reconstruction import Model
-from stage_service.api import bodies, places
+from stage_service.api import bodies
 from stage_service.api.app import create_app
 from stage_service.api.gate import Access
 from stage_service.cli import main
 from stage_service.cli.stage import processes
 from stage_service.cli.support.commands import Output
 from stage_service.config import RigFile
-from stage_service.jobs.records import PipelineRequest
-from stage_service.records import logins
 from stage_service.records.tokens import SCOPES, TokenError, Tokens
 from stage_service.service import Service
 
@@ -201,12 +197,6 @@ def test_requests_of_another_site_are_refused(service, origin):
     assert done(service) == [("127.0.0.1:123", "blackout")]
 
 
-def test_listeners_leave_places_for_requests(call, tokens, monkeypatch):
-    none = dataclasses.replace(places.LIMITS["streams"], all=0)
-    monkeypatch.setitem(places.LIMITS, "streams", none)
-    assert "event streams" in refused(call("GET /events", "mine"), "no-place", 503)["detail"]
-
-
 def test_a_request_is_no_larger_than_it_need_be(call, tokens):
     token = tokens.make("ada", SCOPES)
 
@@ -224,25 +214,6 @@ def test_a_request_is_no_larger_than_it_need_be(call, tokens):
         "problems"
     ]
     assert (len(reported), reported[-1]) == (21, "lights: 3981 more such names")
-
-
-def test_a_job_submitted_twice_under_one_key_is_one_job(call, tokens, service, monkeypatch):
-    submitted = []
-
-    def submit(job: str, _request: Any) -> Any:
-        submitted.append(job)
-        requested, model = PipelineRequest(name="fit"), Model(service.root / "models" / job)
-        return service._queue.submit(requested, service.root / "captures" / "x", model, job=job)
-
-    monkeypatch.setattr(service.jobs, "_submit", submit)
-    app = create_app(service)
-    body = {"capture": "x", "pipeline": {"name": "fit"}}
-    sent = [
-        send(app, "POST /jobs", {"Idempotency-Key": key}, json=body).json()["id"]
-        for key in ("a", "a", "b")
-    ]
-    assert sent[0] == sent[1] != sent[2]
-    assert submitted == [sent[0], sent[2]]
 
 
 def test_a_token_that_is_revoked_ends_what_follows_the_events(rig_file, tmp_path):
@@ -308,27 +279,6 @@ def test_a_browser_that_logs_in_needs_no_token_any_more(call, tokens, service):
     assert done(service) == [("ada", "login")]
 
 
-def test_a_login_ends_with_logout_revocation_and_time(call, tokens, monkeypatch):
-    tokens.make("ada", ("read",))
-    bob = tokens.make("bob", ("read",))
-
-    def log_in(token: str) -> dict[str, Any]:
-        cookie = call("POST /login", json={"token": token}).headers["set-cookie"].partition(";")[0]
-        return {"headers": {"Cookie": cookie}}
-
-    first, second = log_in("mine"), log_in("mine")
-    response = call("POST /logout", **first)
-    assert "=; Path=/; Max-Age=0;" in response.headers["set-cookie"]
-    refused(call("GET /captures", **first), "unauthorized", 401)
-    assert call("GET /captures", **second).status_code == 200
-    third = log_in(bob)
-    assert call("GET /captures", **third).status_code == 200
-    tokens.revoke("bob")
-    refused(call("GET /captures", **third), "unauthorized", 401)
-    monkeypatch.setattr(logins, "LASTS_S", 0.0)
-    refused(call("GET /captures", **log_in("mine")), "unauthorized", 401)
-
-
 def test_a_login_over_tls_stays_there_and_each_port_has_its_own(service, tokens):
     app = create_app(service, Access(tokens))
 
@@ -344,12 +294,6 @@ def test_a_login_over_tls_stays_there_and_each_port_has_its_own(service, tokens)
     assert (name, rules[-8:]) == ("__Host-hairstage", "; Secure")
     names = [log_in(f"http://localhost:{port}").partition("=")[0] for port in (8331, 8332)]
     assert names == ["hairstage-8331", "hairstage-8332"]
-
-
-def test_a_page_of_another_site_logs_nobody_in(call, service):
-    foreign = {"Origin": "http://evil.example"}
-    refused(call("POST /login", json={"token": "mine"}, headers=foreign), "foreign-origin", 403)
-    assert done(service) == []
 
 
 def test_without_required_tokens_a_login_sets_no_cookie(service):

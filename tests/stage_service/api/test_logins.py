@@ -14,8 +14,7 @@ from typing import Any
 import httpx
 import pytest
 from disks import on_small_disk, require_small_disk
-from fastapi import FastAPI
-from serving import URL, refused, routes_of, send
+from serving import refused, routes_of, send
 from waiting import until
 
 from stage_service.api.app import create_app
@@ -396,12 +395,3 @@ def test_a_blackout_that_is_refused_says_that_it_was_not_dark(call, world):
     for body in (b"[", b'{"x": NaN}', b"x" * 2_000_000):  # a blackout has none, and reads none
         assert is_dark(call(DARK, {**right, "Content-Type": "application/json"}, content=body))
     assert world.lit == set()
-
-
-def test_where_nobody_needs_a_token_there_is_no_right(rig_file: RigFile, tmp_path: Path) -> None:
-    service = Service(rig_file, tmp_path / "root")
-    app: FastAPI = create_app(service)
-    try:
-        assert send(app, "GET /login", {"Origin": URL}).json()["blackout"] is None
-    finally:
-        service.close()

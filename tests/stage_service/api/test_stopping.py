@@ -63,15 +63,3 @@ def test_blackout_and_health_respond_while_the_service_stops(
             log.setLevel(level)
     assert service.not_ended == []
     assert not thread.is_alive()
-
-
-def test_parts_that_do_not_stop_are_named_and_others_are_closed(rig_file, tmp_path, monkeypatch):
-    service, stuck = Service(rig_file, tmp_path / "root"), threading.Event()
-    monkeypatch.setattr(service.calibrating, "close", stuck.wait)
-    monkeypatch.setattr(services, "OTHERS_S", 0.1)
-    try:
-        service.close()
-        assert service.not_ended == ["the calibration"]
-    finally:
-        stuck.set()
-    Service(rig_file, tmp_path / "root").close()  # its folder and stage were given up

@@ -10,23 +10,18 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from waiting import until as waited
 
-from reconstruction import CaptureError, verify
-from reconstruction.geometry.rig import RigError
+from reconstruction import verify
 from stage_service.acquisition.states import WrongState
-from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.manager import CaptureManager
-from stage_service.captures.may_light import Busy, NotNow
+from stage_service.captures.may_light import NotNow
 from stage_service.config import RigFile
 from stage_service.plan.capture_plan import CapturePlan
-from stage_service.plan.resolved import PlanError
 
 SHORT = CapturePlan(lights=("light_003", "light_000"), projectors=())
 LONG = CapturePlan(projectors=())
@@ -70,38 +65,6 @@ def test_a_capture_from_start_to_follow_up(manager, world, completed):
     assert verify(manager.path(capture_id)) == []
     states = [e.data["state"] for e in manager.events.wait(0, 0) if e.kind == "capture.state"]
     assert states == ["running", "finishing", "done"]
-
-
-def test_masks_and_plan_are_checked_before_a_folder_exists(manager):
-    with pytest.raises(PlanError):
-        manager.start(CapturePlan(lights=("nobody",)))
-    with pytest.raises(CaptureError, match="mask of cam_0"):
-        manager.start(SHORT, masks={"cam_0": np.zeros((2, 2), bool)})
-    with pytest.raises(CaptureError, match="no camera 'cam_9'"):
-        manager.start(SHORT, masks={"cam_9": np.zeros((6, 8), bool)})
-    assert list(manager.folder.iterdir()) == []
-
-
-def test_one_capture_at_a_time_and_steering(manager, world):
-    first = manager.start(LONG)
-    with pytest.raises(Busy, match=first):
-        manager.start(SHORT)
-    manager.pause(first)
-    until(manager, "capture.state", state="paused")
-    assert not world.lit
-    assert manager.get(first).state == "paused"
-    assert observed(manager)["lights"]["state"] == "ok"
-    manager.resume(first)
-    manager.abort(first)
-    status = manager.wait(first, 20)
-    assert status.outcome == "aborted"
-    assert not world.lit
-    with pytest.raises(WrongState, match="cannot pause a capture that is done"):
-        manager.pause(first)
-    with pytest.raises(UnknownCapture):
-        manager.abort("nobody")
-    second = manager.start(SHORT)
-    assert manager.wait(second, 20).outcome == "completed"
 
 
 def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, world):
@@ -204,13 +167,6 @@ def test_a_closed_manager_starts_nothing(manager):
     manager.close()
     with pytest.raises(NotNow, match="the service is closing"):
         manager.start(SHORT)
-
-
-def test_without_devices_nothing_can_be_shot(rig_file, tmp_path):
-    manager = CaptureManager(replace(rig_file, devices=None), tmp_path / "service")
-    with pytest.raises(RigError, match=r"\[devices\] is missing"):
-        manager.start(SHORT)
-    manager.close()
 
 
 WHOLE = {"kind": "dark", "exposure": 0.01}

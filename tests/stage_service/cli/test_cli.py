@@ -31,7 +31,6 @@ from stage_service.cli import build_parser, main
 from stage_service.cli.support.children import Children
 from stage_service.cli.support.commands import (
     CommandError,
-    progress_bar,
     rig_path,
     run_command,
 )
@@ -71,14 +70,6 @@ def test_every_command_has_help_and_json_output():
         assert len(parser.description or "") > 12, name
         assert len(parser.format_help().splitlines()) > 5, name
         assert "(default: None)" not in parser.format_help(), name
-
-
-def test_where_no_terminal_is_a_line_says_each_end_that_is_reached(capsys):
-    with progress_bar("bench") as progress:
-        for what, share in [("one", 0.0), ("one", 1.0), ("one", 1.0), ("two", 0.5), ("two", 1.0)]:
-            progress(what, share)
-    shown_text = capsys.readouterr().err.splitlines()
-    assert shown_text == ["bench:   0% one", "bench: 100% one", "bench: 100% two"]
 
 
 def test_help_is_fast_because_nothing_heavy_is_imported():
@@ -121,14 +112,6 @@ def test_a_fault_is_one_sentence_with_its_traceback_in_a_file(capsys, tmp_path, 
     assert bool(rest) == debug == (not files)
 
 
-def test_bad_input_has_a_traceback_only_with_debug(capsys, tmp_path):
-    for debug in (False, True):
-        assert main(["verify", str(tmp_path / "none"), *(["--debug"] if debug else [])]) == 3
-        first, *rest = capsys.readouterr().err.splitlines()
-        assert "no such folder" in first
-        assert ("Traceback (most recent call last):" in rest) == bool(rest) == debug
-
-
 def test_wrong_usage_is_exit_code_2(capsys):
     with pytest.raises(SystemExit) as error:
         main(["reconstruct"])
@@ -137,30 +120,6 @@ def test_wrong_usage_is_exit_code_2(capsys):
         main(["--help"])
     assert error.value.code == 0
     assert "exit codes" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ("serve --rig demo --port 99999", "99999 is not from 0 to 65535"),
-        ("serve --rig demo --port x", "invalid number value: 'x'"),
-        ("worker --concurrency 0", "0 is not from 1"),
-    ],
-)
-def test_a_number_that_cannot_be_is_wrong_usage(capsys, words, why):
-    with pytest.raises(SystemExit) as error:
-        main(words.split())
-    assert error.value.code == 2
-    assert why in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("data", [b"\xff\xfe", b"{", b'{"rate_hz": NaN}', b'{"a": 1, "a": 2}'])
-def test_a_plan_that_cannot_be_read_is_named(capsys, tmp_path, data):
-    plan = tmp_path / "plan.json"
-    plan.write_bytes(data)
-    code, shown_text = run(capsys, "capture", "check", "--rig", "demo", "--plan", plan)
-    assert code == 3
-    assert shown_text["error"]["detail"].startswith(f"{plan} is not JSON: ")
 
 
 def test_invalid_service_options_are_refused_before_a_device_is_queried(
@@ -194,29 +153,6 @@ def test_rig_check_counts_and_conditions(capsys, name):
     assert len(pairs) == 3 * data["cameras"]
     assert 0.5 < data["triangulation"]["triangulated"] <= 1.0
     assert data["warnings"] == [] or name == "stage331.toml"
-
-
-@pytest.mark.parametrize(
-    ("command", "options", "place"),
-    [
-        (
-            ["reconstruct", "c", "--out", "m"],
-            {"measure": {"bank": {"kind": 1}}},
-            "options.reconstruct.measure.bank.kind",
-        ),
-        (["fit", "c", "m"], {"hair_pixels": 0}, "options.fit.hair_pixels"),
-        (
-            ["fit", "c", "m", "--method", "inverse_rendering"],
-            {"fit": {"stepps": 3}},
-            "options.inverse_rendering.fit.stepps",
-        ),
-    ],
-)
-def test_a_bad_option_is_one_sentence_with_its_place(capsys, command, options, place):
-    code, data = run(capsys, *command, "--options", json.dumps(options))
-    assert code == 3
-    assert data["error"]["detail"].startswith(f"{place}: ")
-    assert "\n" not in data["error"]["detail"]
 
 
 @pytest.mark.parametrize(

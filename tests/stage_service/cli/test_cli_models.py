@@ -260,16 +260,6 @@ def test_an_edited_model_keeps_its_scalp_map_and_shows_its_material(made, capsys
 
 
 @pytest.mark.usefixtures("fitted")
-def test_strands_in_another_unit_give_a_warning(made, capsys, tmp_path):
-    strands = made.model.strands()
-    for scale, said in ((1, False), (100, True)):
-        write_strands(tmp_path / "s.npz", Strands(scale * strands.points, strands.offsets))
-        out = tmp_path / str(scale)
-        main([*map(str, ("edit", made.model, "--out", out, "--strands", tmp_path / "s.npz"))])
-        assert ("file is in metres" in capsys.readouterr().err) is said
-
-
-@pytest.mark.usefixtures("fitted")
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -331,14 +321,6 @@ def test_render_options_without_effect_are_refused(made, capsys, words, said):
     code, found = run(capsys, "render", *arguments)
     assert code == 3
     assert said in found["error"]["detail"]
-
-
-@pytest.mark.usefixtures("fitted")
-def test_a_picture_makes_its_folder(made, capsys, tmp_path):
-    out = tmp_path / "new" / "picture.png"
-    code, found = run(capsys, "render", made.model, "--size", 16, "--spp", 1, "--out", out)
-    assert (code, found.get("image")) == (0, str(out))
-    assert out.is_file()
 
 
 @pytest.mark.usefixtures("fitted")

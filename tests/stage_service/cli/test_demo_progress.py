@@ -8,12 +8,9 @@ import json
 import pytest
 
 from reconstruction import Rig
-from stage_service.cli.demo_kinds import FULL, LIGHTS, PIXELS, QUICK, quick_rig
+from stage_service.cli.demo_kinds import LIGHTS, PIXELS, quick_rig
 from stage_service.cli.demo_progress import DemoProgress
-from stage_service.cli.support.client import capture_progress, time_text
 from stage_service.cli.support.commands import BadArgument, rig_path
-from stage_service.jobs.pipelines import PIPELINES
-from stage_service.jobs.records import JobOptions
 
 STEPS = ("reconstruct", "fit", "inverse_rendering", "relight", "assess", "evaluate", "results")
 USUAL_S = dict.fromkeys(STEPS, 10.0)  # 70 s in all
@@ -66,21 +63,6 @@ def test_the_runs_own_pace_scales_the_usual_durations(tmp_path):
     ]
 
 
-def test_a_capture_names_the_camera_it_waits_for():
-    silent = {**RENDERING, "doing": ""}
-    assert capture_progress(capture(540.0, silent)) == (
-        "waiting for cam_3 and 1 more, 41 s; 12 of 4,360 frames, 9 min left",
-        0.25,
-    )
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(41.2, "41 s"), (89.0, "89 s"), (540.0, "9 min"), (9000.0, "2.5 h")]
-)
-def test_times_are_as_precise_as_estimates(seconds, text):
-    assert time_text(seconds) == text
-
-
 def test_the_quick_rig_has_fewer_lights_and_pixels(tmp_path):
     file = tmp_path / "rig.json"
     file.write_text(json.dumps(quick_rig(rig_path("demo"))))
@@ -96,10 +78,3 @@ def test_a_rig_without_a_dome_has_no_quick_demo(tmp_path):
     file.write_text("[[lights]]\nname = 'lamp'\n")
     with pytest.raises(BadArgument, match=r"needs a rig file with \[dome\]"):
         quick_rig(file)
-
-
-@pytest.mark.parametrize("kind", [FULL, QUICK])
-def test_the_durations_are_those_of_the_pipelines_steps_until_the_figures(kind):
-    steps = PIPELINES[kind.pipeline]
-    assert tuple(kind.steps_s) == steps[: steps.index("results") + 1]
-    assert JobOptions.model_validate(kind.job_options).label == kind.label

@@ -12,7 +12,7 @@ from browsing import Pages, says
 from serving import serving
 from waiting import until
 
-from reconstruction import Model, Strands
+from reconstruction import Model
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import Blackout
@@ -21,45 +21,6 @@ from stage_service.acquisition.states import CaptureStatus
 pytestmark = pytest.mark.slow  # a browser costs some seconds of processor time a page
 RING = (0x62, 0xA8, 0xB6)
 PACED = {"rate_hz": 8, "projectors": [], "stepping": "software"}
-
-
-def test_a_capture_from_its_plan_to_darkness(console):
-    http, pages = console()
-    page = pages.open("plan")
-    page.fill("[name=rate_hz]", "8")
-    page.fill("[name=projectors]", "none")
-    page.select_option("[name=stepping]", "software")
-    page.wait_for_selector(".cost:has-text('8 Hz')")
-    page.click("text=Start now")
-    page.fill("[name=holder]", "Ada")
-    page.click("dialog button")
-    says(page, "Shooting")
-    assert http.get("/lease").json()["holder"] == "Ada"
-    page.wait_for_selector("circle.light.lit")
-    running = http.service.captures(1)[0]
-    assert running.progress is not None
-    lit = page.text_content("circle.light.lit title")
-    assert lit in {light["name"] for light in http.get("/rig").json()["lights"]}
-
-    page.click("button:text-is('Pause')")
-    says(page, "Paused")
-    assert http.get(f"/captures/{running.id}").json()["state"] == "paused"
-    assert page.query_selector("circle.light.lit") is None
-    page.click("button:text-is('Resume')")
-    says(page, "Shooting")
-    page.keyboard.press("F8")
-    says(page, "Dark, verified")
-    done = http.get(f"/captures/{running.id}").json()
-    assert (done["state"], done["outcome"]) == ("done", "aborted")
-    assert 0 < done["frames_written"] < done["frames_planned"]
-    assert "was aborted" in page.text_content(".status")
-
-    page.click("nav >> text=Frames")
-    picture = page.wait_for_selector("figure img[src]")
-    until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
-    page.keyboard.press("F9")
-    page.wait_for_selector("text=dark, verified, after")
-    assert [a["action"] for a in http.get("/audit").json()][-1] == "blackout"
 
 
 def ring(page: Any) -> int:
@@ -112,26 +73,6 @@ def test_a_capture_by_the_keyboard_alone(console):
     page.keyboard.press("Enter")
     says(page, "Dark, verified")
     assert http.service.captures(1)[0].outcome == "aborted"
-
-
-def test_a_slow_step_shows_how_many_cameras_have_responded(console, monkeypatch):
-    make, go_on = FrameMaker.counts, Event()
-
-    def slow(self, camera, shot, exposure):
-        if camera == "cam_b" and shot.pulse == 3:
-            assert go_on.wait(60)
-        return make(self, camera, shot, exposure)
-
-    monkeypatch.setattr(FrameMaker, "counts", slow)
-    http, pages = console()
-    page = pages.open()
-    http.post("/captures", json={"plan": PACED}).raise_for_status()
-    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have responded')")
-    page.wait_for_selector("p.lit:has-text('waiting for cam_b')")
-    go_on.set()
-    page.wait_for_selector("p.lit:has-text('1 of 2 cameras have responded')", state="detached")
-    page.keyboard.press("F9")
-    says(page, "Dark, verified")
 
 
 def test_invalid_numbers_in_fields_are_refused(console):
@@ -305,18 +246,6 @@ def test_after_a_frame_that_is_missing_the_camera_shows_the_next_ones(console):
     until(lambda: picture.evaluate("image => image.naturalWidth") == 16)
 
 
-def test_repeated_frames_are_no_longer_listed_as_missing(console):
-    http, pages = console(Fault("camera", "drop", 4, "cam_b"))
-    page = pages.open()
-    http.post("/captures", json={"plan": {**PACED, "retries": 0}}).raise_for_status()
-    page.wait_for_selector(".missing:has-text('cam_b — given up')")
-    page.keyboard.press("F8")
-    page.click("button:text-is('Shoot what is missing')")
-    page.wait_for_selector(".status:has-text('is complete')")
-    assert http.service.captures(1)[0].frames_missing == 0
-    page.wait_for_selector(".missing li:text-is('none')")
-
-
 def test_queued_captures_are_reordered(console):
     http, pages = console()
     http.post("/queue:hold")
@@ -431,18 +360,3 @@ def test_an_open_job_shows_its_files_at_its_end_and_runs_again_with_its_options(
     until(lambda: len(http.get("/jobs").json()) == 2)
     again = next(one for one in http.get("/jobs").json() if one["id"] != job)
     assert pipeline.items() <= {"name": again["pipeline"], **again}.items()
-
-
-def test_a_job_with_strands_links_to_the_viewer(console):
-    http, pages = console()
-    plan = {"lights": [], "projectors": []}
-    capture = http.post("/captures", json={"plan": plan}).json()["id"]
-    until(lambda: http.service.capture(capture).outcome == "completed")
-    model = Model(http.service.root / "models" / "mine").create()
-    line = np.array([[0, 0, 0.1], [0, 0, 0.2]], np.float32)
-    model.write_strands(Strands(line, np.array([0, 2]), 4e-5))
-    request = {"capture": capture, "pipeline": {"name": "fit"}, "model": "mine"}
-    job = http.post("/jobs", json=request).json()["id"]
-    page = pages.open(f"jobs/{job}")
-    link = page.wait_for_selector("a:text-is('View the strands')")
-    assert link.evaluate("a => a.href") == f"{pages.url}/view#model=mine"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from datetime import datetime
 from threading import Event
 from typing import Any
 
@@ -71,27 +70,6 @@ def test_an_emergency_stop_is_named_apart_from_watchdog_and_interlock(console):
     assert "interlock" not in alarm.replace("interlock closed", "")
     page.keyboard.press("F9")
     page.wait_for_selector("dd:has-text('reported then: the emergency stop is pressed')")
-
-
-def test_times_are_those_of_the_clock_on_the_wall(console, monkeypatch):
-    http, pages = console()
-    lease = http.post("/lease", json={"holder": "Eve", "seconds": 600}).json()
-    mine = {"Hairstage-Lease": lease["token"]}
-    http.post("/queue", json={"plan": SHORT}, headers=mine).raise_for_status()
-    hold = http.get("/queue").json()["hold"]
-    page = pages.open()
-    started = datetime.fromisoformat(hold["reasons"][0]["at"]).astimezone()
-    page.wait_for_selector(f".quiet:has-text('{started:%H:%M:%S}')")
-    assert "UTC" not in page.inner_text("body")
-    http.post("/queue:go-on", json={"hold": hold["id"]}, headers=mine).raise_for_status()
-    ends = datetime.fromisoformat(lease["expires"]).astimezone()
-    page.wait_for_selector(f".quiet:has-text('Eve steers the stage until {ends:%H:%M:%S}')")
-    page.click("nav >> text=Stage")
-    page.wait_for_selector(f".line:has-text('Eve, until {ends:%H:%M:%S}')")
-    for view in ("now", "plan", "frames", "stage", "jobs"):
-        page.evaluate(f"location.hash = '#{view}'")
-        page.wait_for_selector(f"nav a[href='#{view}'][aria-current]")
-        assert re.findall(r"\d{4}-\d\d-\d\dT\S*", page.inner_text("body")) == []
 
 
 def test_blackout_overtakes_the_pictures_that_a_slow_service_sends(console, small_rig, monkeypatch):
