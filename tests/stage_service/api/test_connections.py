@@ -22,8 +22,8 @@ import uvicorn
 from waiting import until
 
 from stage_service.api import connections
-from stage_service.api.connections import HALL, limits, listening, share
-from stage_service.api.places import LIMITS, Places
+from stage_service.api.connections import limits, listening
+from stage_service.api.places import Places
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 SLOW = b"POST /slow HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\nx"
@@ -99,15 +99,6 @@ def test_headers_have_a_deadline(connect, data, monkeypatch):
 
 def test_headers_have_a_size(connect):
     assert connect(HALF + (17 << 10) * b"a").recv(12) == b"HTTP/1.1 400"
-
-
-def test_connections_leave_descriptors_for_a_capture(monkeypatch):
-    most = HALL + LIMITS["connections"].all
-    assert most == 512  # half of what `select` can watch
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, 1 << 20))
-    assert share() == 1
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 256))
-    assert share() * most == 128
 
 
 def test_a_unix_socket_is_for_user_and_group(tmp_path):

@@ -140,18 +140,6 @@ def test_an_upload_that_is_a_link_is_neither_read_nor_written_through(http, outs
     assert sorted(p.name for p in outside.iterdir()) == ["index.html", "passwd"]
 
 
-def test_a_model_that_is_a_link_does_not_keep_the_trash_from_being_emptied(http, outside):
-    link(http, "models/linked", outside)
-    for name in ("linked", "a"):
-        if name == "a":
-            Model(http.service.root / "models" / name).create()
-        assert http.delete(f"/models/{name}").status_code == 200
-    assert [r["link"] for r in http.get("/trash").json()] == [str(outside), None]
-    assert len(http.delete("/trash", params={"older_than_days": 0}).json()) == 2
-    assert http.get("/trash").json() == []
-    assert (outside / "passwd").read_bytes() == SECRET
-
-
 def test_undeletable_trash_is_named_and_younger_trash_is_deleted(http, monkeypatch):
     for name in ("old", "young"):
         Model(http.service.root / "models" / name).create()
@@ -209,13 +197,3 @@ def test_whatever_a_crash_left_in_the_trash_is_listed_and_goes(http, outside):
     assert len(http.delete("/trash", params={"older_than_days": 0}).json()) == 7
     assert list((root / "trash").iterdir()) == []
     assert (outside / "passwd").read_bytes() == SECRET
-
-
-def test_the_archive_of_a_capture_whose_folder_has_gone_is_an_error(http, tmp_path):
-    place = shot(http)
-    place.rename(tmp_path / "gone")
-    response = http.get(f"/captures/{place.name}/archive.tar")
-    assert (response.status_code, slug(response)) == (409, "damaged-capture")
-    assert str(place) in response.json()["detail"]
-    (tmp_path / "gone").rename(place)
-    assert http.get(f"/captures/{place.name}/archive.tar").status_code == 200
