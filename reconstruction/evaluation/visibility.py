@@ -53,6 +53,22 @@ class Visibility:
             for buffer in self._buffers:
                 buffer.splat(samples)
 
+    def depth_maps(self) -> dict[str, dict[str, AnyFloats]]:
+        """The z-buffers by pinhole camera, which suffice for the test of visibility.
+
+        `depth (H, W)` in metres, infinite where nothing is; `matrix (3, 4)` from the world to
+        homogeneous pixels of the map, whose third row gives the depth; `image (2, 2)`, first and
+        last corner of the camera's image in these pixels.
+        """
+        return {
+            b.lens.name: {
+                "depth": b.depth.reshape(b.shape),
+                "matrix": np.hstack([b.A, b.b]),
+                "image": b.image,
+            }
+            for b in self._buffers
+        }
+
     def __call__(self, points: AnyFloats, tolerance: float = 1e-3) -> Bools:
         """Which of `points (N, 3)` are visible in at least one camera, `(N,)`."""
         out = np.zeros(len(points), bool)

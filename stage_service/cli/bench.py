@@ -31,6 +31,7 @@ BENCHMARKS = {
     "light_planes": "strands of three subjects, still and drifting, compared with baselines",
     "masks": "automatic hair masks compared with true ones, at several path counts",
     "pixels": "strands of patches of fine hair at pixels of 1.8 to 0.25 mm, with baselines",
+    "publish-set": "captures with true strands in open formats, with a scorer; read back, scored",
     "renderers": "our renderers compared with Mitsuba's path integrator, light by light",
     "soak": "a service that shoots for an hour and is killed: memory, frames, blackouts",
     "viewer": "the viewer compared with the path tracer; frames a second; cost of its shader",

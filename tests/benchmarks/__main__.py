@@ -38,6 +38,7 @@ MODULES = {
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",
     "pixels": "benchmarks.pixels.study",
+    "publish-set": "benchmarks.publishing.published_set",
     "renderers": "benchmarks.renderers.errors",
     "soak": "benchmarks.service.soak",
     "viewer": "benchmarks.viewer.shown",

@@ -56,7 +56,7 @@ def write_folder(capture: Capture, folder: Path, written: Written, seed: int = 0
     `hairstage import FOLDER` reads it: `import.toml` says how.
     """
     folder.mkdir(parents=True)
-    _write_colmap(capture, folder / "sparse" / "0")
+    write_colmap(capture, folder / "sparse" / "0")
     with (folder / "lights.csv").open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(("name", "x", "y", "z", "r", "g", "b"))
@@ -72,8 +72,10 @@ def write_folder(capture: Capture, folder: Path, written: Written, seed: int = 0
     return folder
 
 
-def _write_colmap(capture: Capture, folder: Path) -> None:
-    """A model in COLMAP's text, whose pixels are centred at halves."""
+def write_colmap(
+    capture: Capture, folder: Path, unit: float = MM, picture: str = "{}/all.png"
+) -> None:
+    """A model in COLMAP's text, whose pixels are centred at halves; lengths times `unit`."""
     folder.mkdir(parents=True)
     cameras, images = [], []
     for k, camera in enumerate(capture.rig.cameras, 1):
@@ -82,8 +84,8 @@ def _write_colmap(capture: Capture, folder: Path) -> None:
         size = f"{camera.width} {camera.height}"
         cameras.append(f"{k} OPENCV {size} {fx} {fy} {cx} {cy} {k1} {k2} {p1} {p2}\n")
         x, y, z, w = Rotation.from_matrix(camera.R).as_quat()
-        t = " ".join(str(v) for v in MM * camera.t)
-        images.append(f"{k} {w} {x} {y} {z} {t} {k} {camera.name}/all.png\n\n")
+        t = " ".join(str(v) for v in unit * camera.t)
+        images.append(f"{k} {w} {x} {y} {z} {t} {k} {picture.format(camera.name)}\n\n")
     (folder / "cameras.txt").write_text("".join(cameras))
     (folder / "images.txt").write_text("".join(images))
 

@@ -1,0 +1,1 @@
+"""A public benchmark: captures with true strands, written in open formats."""
