@@ -85,36 +85,3 @@ def test_an_echoing_port_is_distinguished_from_another_device(serial_stage, slac
         driver.connect()
     assert "\\d" not in str(e.value)
     driver.close()
-
-
-IDENTITIES = [
-    ("HAIRSTAGE-TRIGGER 2 8", "This is another device: check the ports in the rig file."),
-    ("HAIRSTAGE-PROJECTORS 2 8 left eye", "Its identity is not one of"),
-    ("thermometer", "This is another device: check the ports in the rig file."),
-]
-
-
-@pytest.mark.parametrize(("identity", "advice"), IDENTITIES)
-def test_mismatched_identity_is_reported_in_words(serve, slack, identity, advice):
-    config = serve(lambda line: identity if line == "ID?" else "ERR 1 unknown")
-    config = config.model_copy(update={"timeout_s": TIMEOUT_S * slack})
-    driver = SerialProjectorController(config, ("left",))
-    with pytest.raises(DeviceError) as error:
-        driver.connect()
-    text = str(error.value)
-    assert f"received {identity!r}. {advice}" in text
-    assert "expected a projector controller: 'HAIRSTAGE-PROJECTORS 2', the entries" in text
-    assert not set(text) & set("\\*[]?"), text
-    driver.close()
-
-
-def test_expected_reply_is_reported_without_a_pattern(serve):
-    config = serve(lambda line: "HAIRSTAGE-TRIGGER 2 8" if line == "ID?" else "SEQ asleep")
-    driver = SerialTriggerBox(config)
-    driver.connect()
-    wanted = r"a reply to 'SEQ\?' like 'SEQ <idle\|armed\|running\|done\|stopped> <n> <n> <word>'"
-    with pytest.raises(DeviceError, match=wanted + " within .* received 'SEQ asleep'"):
-        driver.progress()
-    with pytest.raises(DeviceError, match="like 'COUNT <n>' within"):
-        driver.count()
-    driver.close()

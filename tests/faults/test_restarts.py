@@ -13,7 +13,9 @@ from reconstruction.arrays import Bools
 ENTRY = {"plan": {"lights": ["light_000"], "projectors": []}}
 
 
-@pytest.mark.parametrize("ended_by", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "ended_by", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
+)
 def test_lease_and_queue_outlast_a_restart(ended_by, simulated, serve):
     rig_file, world = simulated()
     service, http = serve(rig_file)

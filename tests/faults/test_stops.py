@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-from pathlib import Path
 
 import pytest
 from postgresql import Missing, PostgreSQL, running
@@ -12,8 +11,6 @@ from waiting import until
 
 from simulators.peers.faults import Fault
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-STANDING = ("-m", "benchmarks.service.standing_service")
 WRITE = "reconstruction.files.durable:_write"
 LIT = ("after stage_service.acquisition.exposing:Exposing._light", 6)
 SOFTWARE = {"plan": {"stepping": "software"}}

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reconstruction import Camera, ReconstructOptions
+from reconstruction import Camera
 from reconstruction.capture_scale import CaptureScale, pixel_size
-from reconstruction.reconstruct_options import MeasureOptions
 
 
 def cameras(pixel: float) -> list[Camera]:
@@ -34,11 +33,3 @@ def test_lengths_follow_the_pixel_between_their_bounds() -> None:
         scale = CaptureScale.of_pixel(pixel)
         assert 1e-4 <= scale.thin <= 2e-3
         assert 1e-3 <= scale.grid <= 2e-3
-
-
-def test_given_lengths_stay() -> None:
-    options = ReconstructOptions(
-        grid=3e-3, margin=0.0, measure=MeasureOptions(thin=7e-4, tolerance=5e-3)
-    )
-    scale = CaptureScale.of_pixel(4e-4, options)
-    assert (scale.grid, scale.margin, scale.thin, scale.tolerance) == (3e-3, 0.0, 7e-4, 5e-3)

@@ -100,14 +100,6 @@ def test_plots(report: Report, tmp_path: Path) -> None:
         assert 0.003 < (image.min(axis=2) < 128).mean() < 0.5
 
 
-def test_plots_of_little(tmp_path: Path) -> None:
-    assert plot_report(Report(), tmp_path) == []
-    nothing = Stage("a", 0.0, series=[Series("s", "error", []), Series("t", "error", [(0, 0.0)])])
-    assert [f.name for f in plot_report(Report([nothing]), tmp_path)] == ["seconds.png"]
-    start = Stage("b", 1.0, series=[Series("s", "error", [(0.0, 0.5)])])
-    assert len(plot_report(Report([start]), tmp_path)) == 2
-
-
 def test_geometry_bars(tmp_path: Path) -> None:
     names = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from urllib.parse import unquote
 
@@ -13,7 +12,6 @@ from reconstruction import Mesh, Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
 from stage_service.model_page import model_page, write_page
-from stage_service.model_page.plots import error_plots
 
 EVIL = "<img src=x onerror=alert(1)> & \"'"
 
@@ -96,15 +94,6 @@ def test_everything_that_is_known_stands_on_the_page(model):
     assert text.count("<img src=x onerror=alert(1)>") >= 5  # as text
 
 
-def test_commands_name_the_model_also_where_the_page_is_made_in_it(model, monkeypatch, capsys):
-    monkeypatch.chdir(model.path)
-    assert main(["page", "."]) == 0
-    capsys.readouterr()
-    text = Page(model.file("index.html").read_text(encoding="utf-8")).text
-    assert "hairstage view 'a <b> & c'" in text
-    assert "hairstage export 'a <b> & c' --to blender" in text
-
-
 def test_a_file_that_a_fit_removes_meanwhile_is_not_on_the_page(model, monkeypatch):
     there = model.artifacts()
     gone = model.checkpoint("spatial")
@@ -142,16 +131,6 @@ def test_names_and_messages_are_text_and_nothing_runs_or_is_fetched(model):
 def test_colours_are_shown_as_srgb(model):
     """Linear 0.5 is 188 on a screen (IEC 61966-2-1)."""
     assert any("rgb(255,188,0)" in style for style in Page(model_page(model)).values("style"))
-
-
-def test_a_plot_is_an_svg_in_which_time_goes_right_and_error_up(model):
-    (figure,) = error_plots(model.report()["growth_of_strands"])
-    svg = ET.fromstring(figure).find("svg")
-    line = svg.find("polyline").attrib["points"].split()
-    (x0, y0), (x1, y1) = (map(float, p.split(",")) for p in line)  # an error of 0 has no place
-    assert x0 < x1
-    assert y0 < y1
-    assert svg.attrib["aria-label"].startswith("growth of strands: <img")
 
 
 def test_rendered_and_missing_fits_are_listed_separately(model):

@@ -252,8 +252,7 @@ def test_a_world_that_may_be_is_warned_of(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("by", "turn", "placement"),
     [
-        (1000.0, None, {"unit": "mm"}),
-        (1.0, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], {"up": "y"}),
+        pytest.param(1000.0, None, {"unit": "mm"}, marks=pytest.mark.slow),
         (100.0, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], {"unit": "cm", "up": "y"}),
     ],
 )

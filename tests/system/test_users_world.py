@@ -93,7 +93,12 @@ def of_abc(path: Path) -> np.ndarray:
     return np.array([[p.x, p.y, p.z] for p in values], float)
 
 
-@pytest.mark.parametrize("name", WORLDS)
+FAST = ("colmap", "metashape", "json")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in FAST)) for n in WORLDS]
+)
 def test_exported_strands_lie_on_the_users_pictures(name: str, tmp_path: Path) -> None:
     write, read, file, unit, up = WORLDS[name]
     metres = METRES.get(str(unit), unit)

@@ -38,6 +38,7 @@ def off(maps: HairMaps, truth: HairAppearance) -> float:
     return float(np.abs(np.log(np.array(found) / [*truth.sigma_a, truth.beta_m])).max())
 
 
+@pytest.mark.slow
 def test_black_hair_is_found_darker_than_the_start(tufted):
     truth = HairAppearance((6.0, 9.0, 15.0), 0.25, 0.3)
     found = check(tufted.problem(HairMaps.of(truth), views=1), HairMaps.of(START))
@@ -53,12 +54,14 @@ def test_white_hair_is_found_lighter_than_the_start(tufted):
     assert found.sigma_a.max() < 0.7 * START.sigma_a[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beta_m", [0.02, 0.9])
 def test_a_roughness_that_starts_at_either_end(plain, tufted, beta_m):
     found = check(plain, HairMaps.of(replace(START, beta_m=beta_m)), ENOUGH)
     assert off(found, tufted.truth) < 0.75
 
 
+@pytest.mark.slow
 def test_four_lights_and_one_view(tufted):
     lone = tufted.problem(views=1, lights=tufted.dome(8)[:4], spp=1024)
     quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
@@ -85,6 +88,7 @@ def test_lights_at_a_third_of_the_distance(tufted):
     assert off(found, tufted.truth) < 0.75
 
 
+@pytest.mark.slow
 def test_a_bright_constant_image_makes_the_hair_lighter(plain):
     views = [replace(o, radiance=np.full_like(o.radiance, 0.5 / plain.scale)) for o in plain.views]
     grey = FitProblem(plain.mapped, views, plain.scale, plain.skin)

@@ -12,7 +12,6 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import loop
 from appearance.inverse_rendering.loop import Monitor, run
 from appearance.inverse_rendering.unknowns import encode
-from reconstruction import BadOptions, parse_options
 
 START = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.35))
 
@@ -119,12 +118,3 @@ def test_stages_that_cannot_pay_are_skipped_with_the_reason(plain, options):
     lone = plain.part(np.arange(1), np.arange(3))
     found = run(lone, START, stages=("shared",), options=options)
     assert "no frame can be held out" in str(found.decisions[0])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "place"),
-    [({"steps": 9}, "steps"), ({"shape": (2, 0, 2)}, "shape.1")],
-)
-def test_options_that_make_no_sense_are_refused(wrong, place):
-    with pytest.raises(BadOptions, match=f"options.{place}"):
-        parse_options(InverseRenderingOptions, wrong)

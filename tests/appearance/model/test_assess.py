@@ -70,7 +70,7 @@ def made(tmp_path_factory):
     model.write_strands(strands)
     bright = []
     for camera in cameras:
-        images = render_olat(scene, camera, lights, spp=256, seed=7)
+        images = render_olat(scene, camera, lights, spp=128, seed=7)
         for step, image in zip(steps, images, strict=True):
             writer.write_frame(step, camera.name, image)
         mask = coverage(scene, camera)["hair"] > 0.5

@@ -121,16 +121,6 @@ def test_a_map_that_has_turned_for_long_is_where_it_is(ball):
             render_environment(ball, camera, envmap, Sampling(4), rotation_deg=turn)
 
 
-def test_same_seed_same_bytes(small):
-    scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
-    a, b, other = (
-        render_environment(scene, small.camera(), studio(16), Sampling(8, seed=s))
-        for s in (3, 3, 4)
-    )
-    assert a.tobytes() == b.tobytes()
-    assert (a != other).any()
-
-
 def test_dark_worlds_are_dark(ball):
     assert not render_environment(ball, eye((0, -1, 0)), np.zeros((4, 8, 3)), Sampling(4)).any()
 
@@ -179,7 +169,7 @@ def test_files_that_are_no_maps_are_named(tmp_path):
         load_environment(tmp_path / "negative.exr")
 
 
-@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("axis", [0, *(pytest.param(a, marks=pytest.mark.slow) for a in (1, 2))])
 def test_a_white_fibre_returns_a_white_sky_whichever_way_it_runs(axis):
     """At some 500 hits, over 1,024 directions evenly around: fibres off the middle run along an
     axis but for rounding, where Mitsuba's shading frames are none."""

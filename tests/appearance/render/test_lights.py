@@ -16,8 +16,6 @@ from appearance import (
     render_mixed,
     render_olat,
 )
-from appearance.render import environment, mixed
-from appearance.render.coverage import covered_pixels
 from appearance.render.environment_maps import studio
 from appearance.render.lights import PackedLights
 from appearance.scene.backend import ensure_backend
@@ -216,39 +214,6 @@ def test_mixtures_of_seeds_and_of_nothing(tufted):
         render_mixed(scene, camera, (), [Environment(studio(16), weight=np.nan)])
     with pytest.raises(ValueError, match="greater than 0"):
         Sampling(0)
-
-
-@pytest.mark.parametrize("room", [environment, mixed])
-def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
-    tufted, monkeypatch, caplog, room
-):
-    scene, camera, _ = tufted
-    right, times = room.follow, [0]
-
-    def spoilt(surface, camera, pixels, plan, vertex, *escape):
-        right(surface, camera, pixels, plan, vertex, *escape)
-        if times[0]:
-            dr.scatter(vertex.film, np.nan, mi.UInt32(3 * (len(pixels) // 2)))
-            times[0] -= 1
-
-    def render():
-        if room is mixed:
-            return render_mixed(scene, camera, (), [Environment(studio(16))], Sampling(8))
-        return render_environment(scene, camera, studio(16), Sampling(8))
-
-    monkeypatch.setattr(room, "follow", spoilt)
-    sound = render()
-    index = covered_pixels(scene, camera)
-    pixel = int(index[len(index) // 2])
-    times[0] = 1
-    again = render()
-    changed = (again != sound).any(axis=-1).ravel()
-    assert np.isfinite(again).all()
-    assert set(np.flatnonzero(changed)) <= {pixel}
-    assert str(pixel) in caplog.text
-    times[0] = 2
-    with pytest.raises(FloatingPointError, match=str(pixel)):
-        render()
 
 
 @pytest.mark.usefixtures("mitsubas_shadows")

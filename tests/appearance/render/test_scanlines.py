@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, build_scene, render_olat, render_scanlines
-from appearance.render import scanlines
 from reconstruction import Camera, Light, Projector
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
@@ -99,25 +98,6 @@ def test_a_range_of_rows_is_that_part_of_the_sweep(floor, above):
     assert part["other"].shape == (0, 32, 32, 3)
 
 
-def test_a_moved_subject_is_a_moved_stage(small, above):
-    angle = 0.2
-    turn = np.array(
-        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
-    )
-    shift = np.array([0.005, 0.01, -0.02])
-    source = projector()
-    moved = build_scene(
-        small.no_hair, small.plane().transformed(turn, shift), hair=HAIR, skin=ALBEDO
-    )
-    still = build_scene(small.no_hair, small.plane(), hair=HAIR, skin=ALBEDO)
-    a = render_scanlines(moved, above, [source], spp=64, thrift=0)["proj"]
-    b = render_scanlines(
-        still, above.moved(turn, shift), [source.moved(turn, shift)], spp=64, thrift=0
-    )["proj"]
-    assert a.max() > 1
-    np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-3 * a.max())
-
-
 def test_many_tiles_make_up_the_sweep(floor, above):
     how = {"spp": 64, "max_depth": 1, "thrift": 0}
     one, many = (
@@ -127,16 +107,6 @@ def test_many_tiles_make_up_the_sweep(floor, above):
     np.testing.assert_allclose(many.sum((1, 2)), one.sum((1, 2)), rtol=0.02, atol=0.05 * one.max())
 
 
-def test_same_seed_same_bytes(small):
-    scene = build_scene(small.tuft(), small.plane(), hair=HAIR)
-    a, b, other = (
-        render_scanlines(scene, small.camera(), [projector()], spp=8, seed=s)["proj"]
-        for s in (3, 3, 4)
-    )
-    assert a.tobytes() == b.tobytes()
-    assert (a != other).any()
-
-
 def test_bad_arguments_are_refused(floor, above):
     with pytest.raises(ValueError, match="unknown projectors"):
         render_scanlines(floor, above, [projector()], rows={"nobody": range(3)})
@@ -144,39 +114,3 @@ def test_bad_arguments_are_refused(floor, above):
         render_scanlines(floor, above, [projector()], rows={"proj": range(10, 17)})
     with pytest.raises(ValueError, match="greater than 0"):
         render_scanlines(floor, above, [projector()], spp=0)
-
-
-def test_a_camera_that_sees_nothing_gets_black_rows(floor):
-    away = Camera.look_at("away", 8, 8, (0, 0, 1.0), (0, 0, 2.0), 20)
-    swept = render_scanlines(floor, away, [projector()])["proj"]
-    assert swept.shape == (16, 8, 8, 3)
-    assert not swept.any()
-
-
-@pytest.mark.parametrize("chosen", [False, True])
-def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
-    floor, above, monkeypatch, caplog, chosen
-):
-    """Of the whole picture, and of some pixels of it; neither is as many as the other."""
-    pixels = np.arange(100, 1000, 3) if chosen else None
-    swept, right, times = projector(), scanlines._Plan.render, [0]
-    sound = render_scanlines(floor, above, [swept], spp=4, pixels=pixels)["proj"]
-    pixel = 487
-
-    def spoilt(plan, index, spp, seed):
-        out = right(plan, index, spp, seed)
-        if spp == 4 and times[0]:
-            out["proj"][3, index == pixel] = np.nan
-            times[0] -= 1
-        return out
-
-    monkeypatch.setattr(scanlines._Plan, "render", spoilt)
-    times[0] = 1
-    again = render_scanlines(floor, above, [swept], spp=4, pixels=pixels)["proj"]
-    assert np.isfinite(again).all()
-    changed = (again != sound).any(axis=(0, -1)).ravel()
-    assert np.flatnonzero(changed).tolist() == [129 if chosen else pixel]
-    assert str(pixel) in caplog.text
-    times[0] = 2
-    with pytest.raises(FloatingPointError, match=str(pixel)):
-        render_scanlines(floor, above, [swept], spp=4, pixels=pixels)

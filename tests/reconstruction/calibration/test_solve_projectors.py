@@ -79,6 +79,7 @@ def test_a_board_without_light_is_an_error(nominal_rig: Rig) -> None:
         calibrate_projector(nominal_rig.projectors[0], DecodedRows.join([]))
 
 
+@pytest.mark.slow  # test_solve has it for a whole rig
 def test_rows_decoded_from_frames_give_planes_and_intensity(
     true_rig: Rig, nominal_rig: Rig, board: Board, board_captures: list[Capture]
 ) -> None:

@@ -127,13 +127,6 @@ def test_a_dark_frame_that_is_no_picture_is_refused():
     assert stray_light(np.zeros((1, 1, 3), np.float32)) is None
 
 
-def test_a_mask_of_the_wrong_size_is_named(capture):
-    (capture.path / "masks").mkdir()
-    (capture.path / "masks" / "cam_0.png").write_bytes(b"no picture")
-    with pytest.raises(CaptureError, match=r"cam_0.png: expected a PNG of 8x6"):
-        capture.mask("cam_0")
-
-
 @pytest.mark.parametrize(
     ("step", "problem"),
     [

@@ -220,9 +220,8 @@ def test_degenerate_predictions_give_finite_figures(pred: Strands) -> None:
     assert figures["all"]["1mm_10deg"]["recall"] <= 0.1
 
 
-@pytest.mark.parametrize("pred", [Strands.from_list([]), row()], ids=["none", "some"])
-def test_pictures(pred: Strands, tmp_path: Path) -> None:
-    pictures = draw_errors(assess_strands(pred, brush(400), samples=500), tmp_path)
+def test_pictures(tmp_path: Path) -> None:
+    pictures = draw_errors(assess_strands(row(), brush(400), samples=500), tmp_path)
     assert {p.name for p in pictures} == {"distance.png", "angle.png"}
     assert all(p.stat().st_size > 5000 for p in pictures)
 

@@ -125,15 +125,6 @@ def test_equal_length_is_the_true_metres_to_half_a_strand() -> None:
         assert abs(left - true.lengths().sum()) <= pred.lengths().max() / 2 + 1e-6
 
 
-def test_half_of_the_truth() -> None:
-    true = curtain()
-    half = true.subset(np.arange(0, len(true), 2))
-    scores = compare_strands(half, true)["all"]["1mm_10deg"]
-    assert scores["precision"] == 1.0
-    assert scores["recall"] == pytest.approx(0.52, abs=1e-9)  # 13 of 25 lines
-    assert scores["f"] == pytest.approx(2 * 0.52 / 1.52)
-
-
 def test_no_prediction_scores_nothing(front: Camera) -> None:
     scores = compare_strands(
         Strands.from_list([]), curtain(), visibility=Visibility([front], curtain())

@@ -63,6 +63,7 @@ def helices(p: np.ndarray) -> np.ndarray:
     return np.stack([-p[:, 1], p[:, 0], np.full(len(p), 5e-3)], axis=1)
 
 
+@pytest.mark.slow
 def test_strands_do_not_depend_on_threads() -> None:
     field = analytic(helices, (29, 29, 61))
     roots = np.random.default_rng(0).uniform([-0.01, -0.01, -0.03], [0.01, 0.01, 0.02], (4500, 3))

@@ -75,13 +75,6 @@ def test_a_strand_crosses_others_without_turning_into_them() -> None:
         assert np.ptp(path, axis=0).max() > 0.035
 
 
-def test_the_same_seed_gives_the_same_strands() -> None:
-    lines = lock(500, 2e-4, 5.0)
-    a, b = surface_strands(lines, seed=3), surface_strands(lines, seed=3)
-    assert len(a) == len(b)
-    assert all(np.array_equal(p, q) for p, q in zip(a, b, strict=True))
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_lines_make_no_strand(count: int) -> None:
     lines = lock(50, 0.0, 0.0)

@@ -86,10 +86,10 @@ def posed(fit: HeadFit) -> Mesh:
 @pytest.mark.parametrize(
     ("where", "part", "outliers", "normals", "median"),
     [
-        (everywhere, "head", 0.0, True, 0.3),
+        pytest.param(everywhere, "head", 0.0, True, 0.3, marks=pytest.mark.slow),
         (everywhere, "head", 0.3, False, 0.4),
-        (lambda p, scalp: scalp, "scalp", 0.3, True, 0.3),
-        (lambda p, scalp: p[:, 0] > 0, "head", 0.0, True, 0.6),
+        pytest.param(lambda p, scalp: scalp, "scalp", 0.3, True, 0.3, marks=pytest.mark.slow),
+        pytest.param(lambda p, scalp: p[:, 0] > 0, "head", 0.0, True, 0.6, marks=pytest.mark.slow),
         (lambda p, scalp: ~scalp & (p[:, 2] > -0.12), "head", 0.0, True, 4.0),
     ],
     ids=["all", "30 % outliers, no normals", "scalp, 30 % outliers", "one side", "bare skin"],

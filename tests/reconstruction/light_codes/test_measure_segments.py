@@ -131,13 +131,6 @@ def test_strands_are_cut_at_the_balls_surface() -> None:
     assert len(Ball((0, 0, 0), 0.02).cut(Strands.from_list([outside]))) == 0
 
 
-def test_part_of_a_capture_keeps_the_options(shot: Capture) -> None:
-    some = part_of(shot, cameras=3, lights=5)
-    assert [c.name for c in some.rig.cameras] == ["c0", "c4", "c7"]
-    assert len(some.olat_lights()) == 5
-    assert len(shot.olat_lights()) == 36
-
-
 def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
     hull = VoxelGrid(np.array([-0.05, -0.05, -0.05]), 2e-3, np.ones((60, 50, 50), bool))
     center, radius = np.array([0.0, 0.01, -0.01]), 0.02013  # no centre lies on its surface

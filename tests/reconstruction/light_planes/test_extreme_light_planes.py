@@ -147,6 +147,7 @@ def test_rays_within_their_planes_leave_the_masks_alone(
     finite(tmp_path, report)
 
 
+@pytest.mark.slow  # of a sweep alone, test_triangulation has it
 def test_stripes_that_are_all_saturated_are_found_at_their_middle(
     stage: Shoot, tmp_path: Path
 ) -> None:
@@ -268,6 +269,7 @@ def leaps(
     )
 
 
+@pytest.mark.slow
 def test_motion_beyond_the_search_window_is_reported_and_its_stripes_are_skipped(
     leaps: Capture,
 ) -> None:

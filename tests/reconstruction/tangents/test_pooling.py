@@ -64,13 +64,6 @@ def test_evidence_of_noise_gets_no_weight_and_the_other_all() -> None:
     assert chosen(points, SPACING, noise / 1e3, good).weight >= 3.0
 
 
-def test_given_values_stay() -> None:
-    points = plane(10)
-    scores = halves(turning(points, 8e-3), 0.5)
-    found = chosen(points, SPACING, scores, scores, radius=7e-4, weight=2.5)
-    assert (found.radius, found.weight) == (7e-4, 2.5)
-
-
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_points_and_flat_scores_still_give_a_radius(count: int) -> None:
     points = plane(2)[:count]

@@ -59,13 +59,6 @@ def test_coarse_guides_become_smooth_curves() -> None:
     assert turn.max() < 25  # a millimetre of the circle is 14 degrees
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
-    one, again, other = (fine_groom(guides(6), CENTER, 0.01, seed=s) for s in (0, 0, 1))
-    assert one.points.tobytes() == again.points.tobytes()
-    assert one.points.tobytes() != other.points.tobytes()
-
-
 def test_a_ball_beside_the_hair_is_refused() -> None:
     with pytest.raises(ValueError, match="no strand passes the ball"):
         fine_groom(guides(3), (1.0, 0.0, 0.0), 0.01)

@@ -90,7 +90,9 @@ def test_styles_differ_in_how_much_they_turn(subjects):
     assert turn["straight"] < 0.6 * turn["wavy"] < 0.5 * turn["curly"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [NAMES[0], *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES[1:])]
+)
 def test_the_full_groom_has_a_head_of_hair(name):
     subject = make_subject(name, 0)
     assert 8_000 <= len(subject.strands) <= 12_000

@@ -108,27 +108,3 @@ def test_what_busy_cameras_report_predicts_the_rest_and_what_is_waited_for():
     assert now.waiting is None
     assert now.seconds_left == round(4 * 15.02, 1)
     assert now.share == round(95 / (95 + 4 * 15.02), 4)
-
-
-def test_a_slow_first_step_is_not_the_pace_and_a_longer_exposure_takes_longer():
-    clock = Watch()
-    closing = [Step(30, "all_on", 0.02), Step(31, "tracking", 2.0)]
-    run = RunProgress([*STEPS[:10], *closing], {"a": 0}, lambda _: None, clock)
-    for step in STEPS[:10]:
-        run.begin(step)
-        clock.now += 600.0 if step.index == 0 else 0.11
-        run.done(step)
-    assert run.now().seconds_left == round(0.12 + 2.1, 1)
-
-
-def test_the_share_of_a_continued_run_begins_with_the_steps_shot_before():
-    clock = Watch()
-    run = RunProgress(STEPS, {"a": 10}, lambda _: None, clock)
-    run.skip(STEPS[:15])
-    assert run.now().share == 0.5
-    for step in STEPS[15:20]:
-        run.begin(step)
-        clock.now += 1.0
-        run.done(step)
-    assert run.now().seconds_left == 10.0
-    assert run.now().share == round(0.5 + 0.5 * 5 / 15, 4)

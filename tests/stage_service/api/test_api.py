@@ -346,14 +346,6 @@ def test_events_are_numbered_and_replay_from_the_last_event_id(http, server):
     problem(http.get("/events", headers={"Last-Event-ID": "-1"}), "invalid-request")
 
 
-def test_job_events_follow_the_queue(http, server, tmp_path):
-    before = server.service.events.last
-    request, model = PipelineRequest(name="fit"), Model(tmp_path / "m")
-    server.service._queue.submit(request, tmp_path, model, job="job-7")
-    (event,) = read_events(http, 1, {"Last-Event-ID": str(before)})
-    assert (event["kind"], event["data"]["state"]) == ("job.state", "queued")
-
-
 @pytest.mark.parametrize("text", ["", '{"job": "job-8"', "[]"])
 def test_progress_that_a_power_cut_left_ends_nothing(http, server, tmp_path, text):
     """Neither the list of jobs nor the thread that tells of them."""

@@ -247,15 +247,6 @@ def test_files_that_a_job_removes_while_they_are_listed_are_left_out(http, monke
         assert slug(http.get(path)) == "in-use"
 
 
-def test_a_snapshot_is_nothing_to_keep(http):
-    http.post("/snapshot", json={})
-    until(lambda: http.get("/captures/snapshot").json()["state"] == "done")
-    response = http.delete("/captures/snapshot")
-    assert slug(response) == "bad-input"
-    assert "kept until the next one only" in response.json()["detail"]
-    assert http.get("/trash").json() == []
-
-
 def test_a_snapshot_is_there_until_the_next_one_whatever_becomes_of_the_service(rig_file, tmp_path):
     root = tmp_path / "root"
     with serving(rig_file, root) as http:

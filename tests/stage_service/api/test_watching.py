@@ -8,7 +8,6 @@ import shutil
 import threading
 from collections import namedtuple
 
-import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from serving import Client, serving
 from waiting import until
@@ -177,16 +176,3 @@ def test_the_log_as_json_has_what_it_is_about(capsys, monkeypatch):
     assert first["message"] == "caf\udce9"
     assert first["error"].endswith('ValueError: a "line"\nbreak')
     assert "capture" not in second
-
-
-@pytest.mark.parametrize("path", ["/metrics", "/ready"])
-def test_both_are_for_whoever_may_read(rig_file, tmp_path, path):
-    from stage_service.api.gate import Access
-    from stage_service.records.tokens import Tokens
-
-    tokens = Tokens(tmp_path / "tokens.json", own="mine")
-    read, steer = tokens.make("r", ("read",)), tokens.make("s", ("steer",))
-    with serving(rig_file, tmp_path, Access(tokens)) as http:
-        for token, status in ((read, 200), (steer, 403), ("guessed", 401)):
-            headers = {"Authorization": f"Bearer {token}"}
-            assert http.get(path, headers=headers).status_code == status

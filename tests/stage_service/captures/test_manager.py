@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from waiting import until as waited
 
-from reconstruction import verify
 from stage_service.acquisition.states import WrongState
 from stage_service.captures.manager import CaptureManager
 from stage_service.captures.may_light import NotNow
@@ -51,20 +50,6 @@ def until(manager: CaptureManager, kind: str, **wanted: Any) -> Any:
             if event.kind == kind and wanted.items() <= event.data.items():
                 return event
     raise AssertionError(kind)
-
-
-def test_a_capture_from_start_to_follow_up(manager, world, completed):
-    capture_id = manager.start(SHORT, extra={"pipeline": "full"})
-    status = manager.wait(capture_id, 20)
-    assert (status.state, status.outcome, status.error) == ("done", "completed", None)
-    assert (status.step, status.steps) == (6, 6)
-    assert (status.frames_written, status.frames_missing) == (18, 0)
-    assert status.request == {"pipeline": "full"}
-    assert completed == [status]
-    assert manager.list() == [status]
-    assert verify(manager.path(capture_id)) == []
-    states = [e.data["state"] for e in manager.events.wait(0, 0) if e.kind == "capture.state"]
-    assert states == ["running", "finishing", "done"]
 
 
 def test_blackout_ends_a_capture_at_once_even_while_cameras_are_busy(manager, world):

@@ -23,7 +23,6 @@ from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import (
-    Cancelled,
     DeviceError,
     DeviceTimeout,
     DeviceUnreachable,
@@ -227,17 +226,6 @@ def test_a_non_numeric_reply_raises_an_error_that_names_the_camera(rig_file, hel
 
         with pytest.raises(DeviceError, match=r"^camera cam_0 "):
             shoot()
-
-
-def test_mute_and_busy_cameras(stage, world):
-    world.mute = {"cam_0"}
-    with pytest.raises(DeviceTimeout, match=r"cam_0.*within"):
-        stage.cameras[0].read(NEVER)
-    world.busy = {"cam_1": 10**9}
-    cancel = threading.Event()
-    threading.Timer(0.05, cancel.set).start()
-    with pytest.raises(Cancelled):
-        stage.cameras[1].read(cancel)
 
 
 def test_all_cameras_at_once_and_every_failure_is_named(stage, world, slack):

@@ -35,13 +35,6 @@ def test_the_deviation_is_the_sagitta_of_the_chords():
     assert packed.deviation[0] <= 1e-4
 
 
-def test_a_tighter_curl_takes_more_points():
-    angle = np.linspace(0, 40 * np.pi, 4001)
-    curl = np.stack([0.004 * np.cos(angle), 0.004 * np.sin(angle), 0.001 * angle], axis=1)
-    packed = PackedStrands.of(Strands.from_list([curl]))
-    assert packed.points.shape[1] >= 128
-
-
 @pytest.mark.parametrize("part", [20, 60])
 def test_any_beginning_of_the_order_is_spread_over_all_strands(part):
     order = PackedStrands.of(arcs(300, 0.05, 20)).order
