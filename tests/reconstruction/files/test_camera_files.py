@@ -279,31 +279,6 @@ def test_the_example_of_colmaps_documentation(tmp_path: Path) -> None:
     np.testing.assert_allclose(file.cameras[0].center, -R.T @ [-0.737434, 1.02973, 3.74354])
 
 
-def no_points(text: str) -> str:
-    """Each image line alone."""
-    return "\n".join(x for x in text.split("\n") if x.endswith(".jpg") or x[:1] == "#")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        no_points,
-        lambda t: "\ufeff" + t.replace("\n", "\r\n"),
-        lambda t: no_points(t).replace(".jpg", ".jpg\n# of this image\n\n"),
-        lambda t: t.replace(".jpg", ".jpg\n# of this image"),
-        lambda t: t.replace(" cam_", "  my folder/ cam_").replace("my folder/ ", "my  folder/"),
-        lambda t: "# Number of images: 6, mean observations per image: 1\n" + t.replace(" ", "\t"),
-    ],
-)
-def test_images_txt_is_read_by_what_its_lines_are(change, tmp_path: Path) -> None:
-    writers.write_colmap_text(tmp_path / "sparse", writers.stage())
-    path = tmp_path / "sparse/images.txt"
-    path.write_text(change(path.read_text()), encoding="utf-8", newline="")
-    file = read_cameras(tmp_path / "sparse")
-    assert_same_pixels(file.cameras, writers.stage())
-    assert file.notes == []
-
-
 def test_what_a_colmap_model_lacks_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "sparse"
     writers.write_colmap_text(folder, writers.stage())

@@ -14,14 +14,6 @@ from reconstruction import Camera, Rig
 from reconstruction.files.lights import LightFileError, read_lights
 
 
-def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
-    path = tmp_path / "lights.csv"
-    path.write_text("\ufeffname,x,y,z\nlight_005,0,1,2\nlight_002,3,4,5\n", encoding="utf-8")
-    found = read_lights(path).lights
-    assert [light.name for light in found] == ["light_005", "light_002"]
-    np.testing.assert_array_equal(found[1].position, (3, 4, 5))
-
-
 def test_a_spreadsheet_may_have_semicolons_and_decimal_commas(tmp_path: Path) -> None:
     path = tmp_path / "lights.csv"
     path.write_text("name;x;y;z;intensity\nkey;1,5;-2;0,25;3\nfill; 0;1,0;2;0,5\n")

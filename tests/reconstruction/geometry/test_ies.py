@@ -210,30 +210,6 @@ def test_malformed_files_name_file_and_line(tmp_path, content, line, said):
         read_ies(write(tmp_path, content))
 
 
-@pytest.mark.parametrize(
-    ("encoding", "change"),
-    [
-        ("latin-1", lambda t: "\n \n" + t),
-        ("utf-8-sig", lambda t: t),
-        ("utf-16", lambda t: t),
-        ("latin-1", lambda t: t.replace("IESNA:LM", "IESNA: LM")),
-        ("latin-1", lambda t: t.replace("IESNA:LM", " iesna : lm")),
-        ("latin-1", lambda t: t.replace("IESNA:LM-63-2002", "IESNA:LM-63-2019")),
-        ("latin-1", lambda t: t.replace("IESNA:LM-63-2002", "IES:LM-63-19")),
-        ("latin-1", lambda t: t.replace("TILT=NONE", " TILT = NONE ")),
-        ("latin-1", lambda t: t.replace("TILT=NONE", "tilt=none")),
-        ("latin-1", lambda t: t.replace("[TEST]", "made by hand, 20 \xb0\n[TEST]")),
-        ("latin-1", lambda t: t.replace("\n", "\r\n") + "\x1a"),
-        ("latin-1", lambda t: t.replace("\n", "\r")),
-    ],
-)
-def test_a_file_is_read_whatever_its_blanks_and_marks(tmp_path, encoding, change):
-    """With a future use of 0, which would be a factor in an edition of 1995."""
-    path = tmp_path / "lamp.ies"
-    path.write_bytes(change(text(ballast=(1, 0, 20))).encode(encoding))
-    assert read_ies(path).at([0, 0, 1]) == pytest.approx(100)
-
-
 def test_an_absent_file_is_named(tmp_path):
     with pytest.raises(IesError, match=r"none\.ies: cannot be read"):
         read_ies(tmp_path / "none.ies")

@@ -180,14 +180,6 @@ def test_a_subject_that_no_camera_sees_is_an_error(
         reconstruct(stage(cameras=away), Model(tmp_path), options=QUICK)
 
 
-def test_a_scalp_without_hair_is_an_error(stage: Shoot, tmp_path: Path) -> None:
-    """The subject is the head itself: what is lit is skin, by the user's word."""
-    capture = stage(ball(RADIUS))
-    paint_masks(capture, lambda c: np.zeros((c.height, c.width), bool))
-    with pytest.raises(CaptureError, match="no pixel of any camera is hair"):
-        reconstruct(capture, Model(tmp_path), options=QUICK)
-
-
 def test_a_bald_head_with_a_tuft_has_strands_there_alone(stage: Shoot, tmp_path: Path) -> None:
     capture = stage()
 
