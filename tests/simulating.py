@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from waiting import slowed
 
-from reconstruction import Rig
+from reconstruction import Mesh, Rig, Strands, write_obj, write_strands
 from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.responses import Response
 from simulators.peers.devices import DEVICES_FILE, SimulatedStage
@@ -104,6 +104,16 @@ class Flat:
         pixels = np.arange(c.width * c.height)
         images = np.broadcast_to(levels[:, None, None], (len(levels), len(pixels), 3))
         return Response(pixels, images.astype(np.float32))
+
+
+def small_subject(folder: Path) -> list[str | Path]:
+    """Arguments of `python -m simulators` for three strands on a tetrahedron, fast to render."""
+    corners = 0.08 * np.array([[1.0, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    write_obj(folder / "head.obj", Mesh(corners, faces, np.ones(4, bool)))
+    lines = [np.linspace(1.0, 1.5, 5)[:, None] * corner for corner in corners[:3]]
+    write_strands(folder / "subject.npz", Strands.from_list(lines, radius=1e-3))
+    return ["--subject", folder / "subject.npz", "--head", folder / "head.obj"]
 
 
 def small_rig_text(slack: int) -> str:

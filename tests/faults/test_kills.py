@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from simulating import small_subject
 from standing import PLACES
 from waiting import until
 
@@ -88,7 +89,10 @@ def test_sigkill_of_the_devices(simulated, tmp_path, add_row):
     with (tmp_path / "log").open("w") as log:
         command = [sys.executable, "-m", "simulators", "--rig", rig, "--state", state]
         peers = subprocess.Popen(
-            [*command, "--ports", "auto", "--spp", "1"], cwd=CHECKOUT, stdout=log, stderr=log
+            [*command, "--ports", "auto", "--spp", "1", *small_subject(tmp_path)],
+            cwd=CHECKOUT,
+            stdout=log,
+            stderr=log,
         )
     try:
         until(lambda: (state / DEVICES_FILE).exists() or peers.poll() is not None)

@@ -9,6 +9,7 @@ import sys
 import tomllib
 
 import pytest
+from simulating import small_subject
 
 from simulators.__main__ import main
 
@@ -41,7 +42,8 @@ def run(*arguments, **more):
 
 def test_the_command_says_when_it_is_ready_and_ends_on_sigterm(rig_file, tmp_path):
     state, truth = tmp_path / "state", tmp_path / "truth"
-    with run("--rig", rig_file, "--state", state, "--truth", truth, "--ports", "auto") as process:
+    words = ("--rig", rig_file, "--state", state, "--truth", truth, "--ports", "auto")
+    with run(*words, *small_subject(tmp_path)) as process:
         ready = json.loads(process.stdout.readline())
         devices = tomllib.loads((state / "devices.toml").read_text())["devices"]
         assert ready["ready"] is True
