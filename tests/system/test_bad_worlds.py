@@ -288,6 +288,7 @@ def test_a_lit_wall_is_no_part_of_the_head(wall: float, tmp_path: Path, usual: O
     assert found.warnings == usual.warnings
 
 
+@pytest.mark.slow
 def test_what_a_mirror_shows_is_no_part_of_the_head(tmp_path: Path, usual: Outcome) -> None:
     found = outcome(World(mirror=True).write(tmp_path / "folder"))
     assert found.litres == pytest.approx(usual.litres, rel=0.05)

@@ -37,7 +37,10 @@ def fitted(planted, views, options=EXACT, monitor=None):
     return fit_pictures(views, planted.places, planted.scale, options, monitor)
 
 
-@pytest.mark.parametrize("kind", ["modulation", "additive", "whole"])
+@pytest.mark.parametrize(
+    "kind",
+    [*(pytest.param(k, marks=pytest.mark.slow) for k in ("modulation", "additive")), "whole"],
+)
 def test_a_planted_field_is_found_back(planted, kind):
     truth = planted.truth(kind)
     views = planted.views(truth)

@@ -178,6 +178,7 @@ def colour_error(problem: FitProblem, tufted) -> float:
     return float(np.abs(found / truth - 1).max())
 
 
+@pytest.mark.slow
 def test_colours_under_near_lights_with_axes(tufted) -> None:
     problem = tufted.problem(lights=near_lights(tufted))
     alike = [

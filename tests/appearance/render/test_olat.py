@@ -139,6 +139,7 @@ def test_lights_that_overflow_are_refused(tufted):
         render_olat(scene, camera, [lights[1], blinding])
 
 
+@pytest.mark.slow
 def test_indirect_light_is_what_direct_light_lacks(small, tufted):
     """A plane cannot see itself: it has none."""
     scene, camera, lights = tufted

@@ -137,7 +137,7 @@ def test_another_hair_material_runs_in_the_same_kernel(small):
     assert len(kernels) == 1
 
 
-@pytest.mark.parametrize("bsdf", ["extended_hair", "hair"])
+@pytest.mark.parametrize("bsdf", ["extended_hair", pytest.param("hair", marks=pytest.mark.slow)])
 def test_a_positive_tilt_moves_the_first_reflection_towards_the_root(bsdf):
     """A vertical fibre, root below, lit level: R goes down by twice the tilt."""
     fibre = Strands(np.array([[0, 0, -0.2], [0, 0, 0.2]], np.float32), np.array([0, 2]), 0.01)

@@ -115,7 +115,7 @@ def test_few_points_give_a_pose() -> None:
     assert fit.deformed.to_points_median > 0.02  # and it shows that most of the head was not seen
 
 
-@pytest.mark.parametrize("part", ["head", "scalp"])
+@pytest.mark.parametrize("part", ["head", pytest.param("scalp", marks=pytest.mark.slow)])
 def test_inward_normals_raise_an_error(part: Part) -> None:
     """As of scanners and meshes that are inside out; the head came out centimetres off."""
     head = generic_head()

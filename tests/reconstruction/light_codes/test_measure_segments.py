@@ -80,6 +80,7 @@ def test_no_light_beside_a_camera_gives_a_warning(
     assert any("no light is beside" in w for w in report["lightcodes"].warnings)
 
 
+@pytest.mark.slow
 def test_one_light_is_enough_for_lines(shot: Capture, tmp_path: Path) -> None:
     report = run(part_of(shot, cameras=4, lights=1), tmp_path)
     assert report["lightcodes"].figures["lights"] == 1

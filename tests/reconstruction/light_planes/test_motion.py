@@ -102,7 +102,7 @@ def pose_error(motion: Motion, poses: list[tuple[np.ndarray, np.ndarray]]) -> np
     )
 
 
-@pytest.mark.parametrize("method", ["direct", "registered"])
+@pytest.mark.parametrize("method", ["direct", pytest.param("registered", marks=pytest.mark.slow)])
 def test_drift_is_found_to_a_tenth_of_a_pixel(
     moving: Capture, method: Literal["direct", "registered"]
 ) -> None:

@@ -163,6 +163,7 @@ def test_isolated_points_are_outliers() -> None:
     assert not supported(points[:5], np.ones(5), 8, 4.0).any()
 
 
+@pytest.mark.slow
 def test_points_of_a_coarse_camera_alone_are_kept_beside_a_fine_camera(
     shoot: Shoot, stage_camera: Callable[..., Camera], stage_projector: Callable[..., Projector]
 ) -> None:

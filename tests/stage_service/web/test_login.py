@@ -11,7 +11,7 @@ from stage_service.records.attempts import FREE
 from stage_service.records.tokens import Tokens
 
 
-@pytest.mark.parametrize("prefix", ["", "/stage"])
+@pytest.mark.parametrize("prefix", [pytest.param("", marks=pytest.mark.slow), "/stage"])
 def test_a_page_without_a_login_shows_the_login_form(simulated, browser, tmp_path, prefix):
     """Under a path prefix every request of the page has it."""
     access, paths = Access(Tokens(tmp_path / "none", "the key"), prefix=prefix), []
