@@ -132,13 +132,13 @@ class _Probe:
 
     @cached_property
     def lights(self) -> int:
-        """Images of a camera that give directions: under single lights, else one fully lit."""
-        return len(self.capture.olat_lights()) or int(self.capture.under_constant_light())
+        """Images of a camera that give directions: under single lights, else a lit one."""
+        return len(self.capture.olat_lights()) or int(bool(self.capture.without_single_lights()))
 
     @property
     def kind(self) -> StepKind:
         """The kind of these images."""
-        return "all_on" if self.capture.under_constant_light() else "olat"
+        return next((s.kind for s in self.capture.without_single_lights()), "olat")
 
     @cached_property
     def slowness(self) -> float:
@@ -195,7 +195,7 @@ class _Probe:
                 shares.append(mask.mean())
                 continue
             view = replace(self, capture=self.capture.view(cameras=[camera.name]))
-            kinds: list[StepKind] = ["all_on", "olat", "tracking"]
+            kinds: list[StepKind] = ["all_on", "olat", "pattern", "tracking"]
             kind = next((k for k in kinds if view.frames(k)), None)
             if kind is None:
                 continue

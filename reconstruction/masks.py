@@ -104,7 +104,7 @@ def hair_masks(
     mask and the head. Raises `CaptureError` if one of them is missing.
     """
     geometry, masks, views = MaskGeometry.of(points, head), {}, []
-    constant = capture.under_constant_light()
+    constant = bool(capture.without_single_lights())
     for camera in capture.rig.cameras:
         user = capture.mask(camera.name)
         if user is None and not any(capture.has(s, camera.name) for s in capture.steps):

@@ -129,7 +129,7 @@ class _Run:
             if not capture.olat_lights():
                 raise CaptureError(
                     f"{capture.path}: no OLAT frames, which the method '{method}' needs; 'hull' "
-                    "takes photographs under constant light"
+                    "takes photographs under constant light and patterns"
                 )
             scale = measuring.scale(masked, cloud, head)
             envelope, depths = measuring.envelope(masked, cloud, head.mesh, scale)
@@ -164,12 +164,12 @@ class _Run:
     def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
         """Strands along the smooth field of the hull's surface and all measured lines.
 
-        Single lights, or photographs under constant light, give directions, and line stereo if
-        pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without a head no
+        Single lights, photographs under constant light or patterns give directions, and line
+        stereo if pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without a head no
         strand has a root.
         """
         o, capture, report = self.stages.options, masked.capture, self.stages.report
-        lit = bool(capture.olat_lights()) or capture.under_constant_light()
+        lit = bool(capture.olat_lights() or capture.without_single_lights())
         mesh = None if head is None else head.mesh
         scale = self.measuring.scale(masked, cloud, head)
         if mesh is None:

@@ -84,7 +84,9 @@ class MeasuringStages(Stages):
             sweep, lights = bool(capture.of_kind("scanline")), len(capture.olat_lights())
             method = method_for(capture)
             holds = f"{'a' if sweep else 'no'} sweep, {lights} single lights, "
-            if capture.under_constant_light():
+            if capture.patterns is not None:
+                holds += f"{len(capture.patterns.names)} patterns of lights, "
+            elif capture.without_single_lights():
                 holds += f"{len(capture.rig.cameras)} photographs under constant light, "
             holds += f"{'no' if head is None else 'a'} head"
             stage.figures.update(method=method, capture_holds=holds)

@@ -286,9 +286,7 @@ def weighted(samples: AnyFloats, weights: AnyFloats) -> Floats:
 
 def irradiance(light: Light, points: Floats) -> Floats:
     """Irradiance `(P, 3)`, W/m², across the ray from a light at `points (P, 3)`."""
-    away = points - light.position
-    squared = np.maximum((away * away).sum(axis=-1, keepdims=True), 1e-12)
-    return np.asarray(light.intensity_towards(points) / squared, np.float32)
+    return np.asarray(light.irradiance(points), np.float32)
 
 
 def _unit(vectors: Array | Floats) -> Floats:

@@ -69,5 +69,4 @@ class Pictures:
 
 def irradiance(light: Light, points: Floats) -> Floats:
     """Irradiance `(P, 3)`, W/m², across the light's direction at `points (P, 3)`."""
-    squared = np.sum((light.position - points) ** 2, axis=-1, keepdims=True)
-    return np.asarray(light.intensity_towards(points) / squared, np.float32)
+    return np.asarray(light.irradiance(points), np.float32)

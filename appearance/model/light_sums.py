@@ -113,9 +113,7 @@ def _nearest(directions: Array, unit: Array) -> Ints:
 def irradiance(lights: Sequence[Light]) -> Array:
     """Irradiance of each light at the origin, across its ray: `(L, 3)`, W/m²."""
     origin = np.zeros(3)
-    return np.array(
-        [x.intensity_towards(origin) / np.square(x.position).sum() for x in lights]
-    ).reshape(-1, 3)
+    return np.array([x.irradiance(origin) for x in lights]).reshape(-1, 3)
 
 
 def few_lights(lights: Sequence[Light], weights: Array, most: int) -> list[tuple[int, Array]]:

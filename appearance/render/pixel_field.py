@@ -62,8 +62,7 @@ class PixelField:
 
     def irradiance(self, light: Light) -> Floats:
         """W/m² across the light's direction, at the points `(P, 3)`."""
-        squared = np.sum((light.position - self.points) ** 2, axis=-1, keepdims=True)
-        return np.asarray(light.intensity_towards(self.points) / squared, np.float32)
+        return np.asarray(light.irradiance(self.points), np.float32)
 
     def added(
         self, lights: Sequence[Light], weights: Array, integrals: Sequence[AnyFloats]

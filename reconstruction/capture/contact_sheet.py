@@ -49,7 +49,7 @@ def _chosen(steps: tuple[Step, ...]) -> list[Step]:
     others = [
         s for kind in ("dark", "all_on", "tracking", "scanline") for s in _of(steps, kind)[:1]
     ]
-    single = _of(steps, "olat")
+    single = [s for s in steps if s.lighting is not None]
     at = np.linspace(0, len(single) - 1, min(MOST_STEPS - len(others), len(single)))
     return [*others, *(single[round(i)] for i in at)]
 
@@ -61,7 +61,7 @@ def _of(steps: tuple[Step, ...], kind: str) -> list[Step]:
 def _name(step: Step) -> str:
     if step.kind == "scanline":
         return f"{step.projector} {step.row}"
-    return step.light if step.kind == "olat" and step.light else step.kind
+    return step.lighting or step.kind
 
 
 def _cell(

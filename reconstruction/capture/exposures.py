@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,6 +42,25 @@ class Merged:
         y, x = np.nonzero(self.saturated & (brightest < full))
         out[y, x, out[y, x].argmax(axis=-1)] = full
         return out, full
+
+
+def averaged(shots: Iterable[tuple[float, Floats, Bools]]) -> tuple[Floats, Bools]:
+    """Mean radiance `(H, W, 3)` of shots (seconds, radiance, saturated), the shortest first.
+
+    Weights are exposures; saturated pixels have none, and are returned as saturated where they are
+    in the shortest, whose radiance they keep if no other has any.
+    """
+    total: Any = 0.0
+    weight: Any = 0.0
+    first: tuple[Floats, Bools] | None = None
+    for seconds, image, saturated in shots:
+        used = np.float32(seconds) * ~saturated
+        total, weight = total + used[..., None] * image, weight + used
+        first = first or (image, saturated)
+    if first is None:
+        raise ValueError("no exposure to average")
+    mean = total / np.maximum(weight, np.finfo(np.float32).tiny)[..., None]
+    return np.where(weight[..., None] > 0, mean, first[0]), first[1]
 
 
 def merge(pictures: Mapping[float, Picture], scale: float = 1.0) -> Merged:

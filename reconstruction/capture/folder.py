@@ -2,7 +2,7 @@
 
 capture/
   rig.json        calibrated geometry (`Rig.to_dict`)
-  plan.json       {"steps": [Step, ...], ...}: the commanded sequence
+  plan.json       {"steps": [Step, ...], "patterns": `LightPatterns.to_dict`, ...}: the sequence
   journal.jsonl   append-only, fsynced: one line per frame, written or missing; locked by the
                   process that writes or compresses the capture
   frames/00012/cam_00.exr    (cam_00.zip.exr once compressed)
@@ -25,6 +25,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from reconstruction.arrays import Bools, Floats
+from reconstruction.capture.exposures import averaged
+from reconstruction.capture.light_patterns import LightPatterns, PatternError
 from reconstruction.capture.records import (
     CaptureError,
     FrameRecord,
@@ -41,6 +43,7 @@ from reconstruction.files.exr import read_exr
 from reconstruction.files.masks import read_mask
 from reconstruction.geometry.blocks import block_any, block_means, unblocked
 from reconstruction.geometry.lens import Lens
+from reconstruction.geometry.lights import Lighting
 from reconstruction.geometry.mesh import Mesh, read_obj
 from reconstruction.geometry.rig import Rig, counted
 from reconstruction.geometry.world_frame import WorldFrame
@@ -87,8 +90,8 @@ class Capture:
     ) -> Capture:
         """An immutable view of the same folder, restricted to these `cameras` and `lights`.
 
-        None keeps those of this view. `lights` selects the single-light frames; the rig keeps all
-        lights. `undistorted` resamples frames and masks to pinhole cameras as they are read; False
+        None keeps those of this view. `lights` selects among `lightings`; the rig keeps all lights.
+        `undistorted` resamples frames and masks to pinhole cameras as they are read; False
         keeps the lenses. `reduced` by n averages n × n pixels; 1 keeps all pixels. Raises
         `CaptureError` for unknown names and for images too small for `reduced`.
         """
@@ -112,13 +115,14 @@ class Capture:
             ]
         out.rig = replace(self.rig, cameras=tuple(chosen))
         if lights is not None:
-            names = self._known("light", lights, self.olat_lights())
-            out.steps = tuple(s for s in self.steps if s.kind != "olat" or s.light in names)
+            names = self._known("light", lights, self.lightings())
+            kind = "olat" if self.olat_lights() else "pattern"
+            out.steps = tuple(s for s in self.steps if s.kind != kind or s.lighting in names)
         return out
 
     def without_lights(self, names: Iterable[str]) -> Capture:
-        """A view without the single-light frames of these lights. Raises `CaptureError`."""
-        known = self.olat_lights()
+        """A view without the frames of these `lightings`. Raises `CaptureError`."""
+        known = self.lightings()
         excluded = self._known("light", names, known)
         return self.view(lights=[name for name in known if name not in excluded])
 
@@ -140,16 +144,10 @@ class Capture:
         shot = self._shot[camera]
         return mask if self._by == 1 else unblocked(mask, self._by, shot.height, shot.width)
 
-    def unlisted_files(self) -> list[Path]:
-        """Files under frames/ that no line of the journal names: leftovers of a crash."""
-        known = {self.path / r.file for r in self.records.values() if r.file is not None}
-        return sorted(p for p in self.path.glob("frames/**/*") if p.is_file() and p not in known)
-
     def read_mask(self, path: Path, camera: str) -> Bools:
         """A mask `(H, W)` in this view's pixels, from an image the size of the frames on disk.
 
-        True where at least half of the averaged pixels are half grey or above. Raises
-        `CaptureError`.
+        True where at least half of the averaged pixels are half grey. Raises `CaptureError`.
         """
         shot, lens = self._shot[camera], self._lenses.get(camera)
         try:
@@ -227,49 +225,35 @@ class Capture:
             return image, saturated
         return block_means(image, self._by), block_any(saturated, self._by)
 
-    def count_scale(self, step: Step, camera: str) -> float:
-        """Radiance of one count of the sensor in this frame; 0 if it was not quantised."""
-        return float(self._read(step, camera)[1].get("countScale", 0.0))
-
     def has_light(self, light: str, camera: str) -> bool:
-        """Whether a single-light frame of this light was written, at any exposure."""
+        """Whether a frame of this single light or pattern was written, at any exposure."""
         return any(self.has(s, camera) for s in self._of_light.get(light, ()))
 
     def light(self, light: str, camera: str) -> Pixels:
-        """Radiance `(H, W, 3)` under one light alone at full level, and saturated pixels `(H, W)`.
+        """Radiance `(H, W, 3)` under one light or pattern at full level, and saturated `(H, W)`.
 
-        The `stray_light` of the dark frames at the nearest exposure is subtracted. Several
-        exposures are averaged with their exposure as weight, without saturated pixels; pixels
-        saturated in the shortest exposure are returned as saturated. Raises `MissingFrame`.
+        The `stray_light` of the dark frames at the nearest exposure is subtracted, and several
+        exposures are `averaged`. Raises `MissingFrame`.
         """
         steps = self._of_light.get(light)
         if steps is None:
-            raise MissingFrame(f"{self.path}: the plan has no single-light frame of {light!r}")
+            raise MissingFrame(f"{self.path}: the plan has no frame under {light!r} alone")
         steps = [s for s in steps if self.has(s, camera)] or steps[:1]
         if len(steps) == 1:
             return self._unlit_subtracted(steps[0], camera)
-        total = np.zeros((*self._shape(camera), 3), np.float32)
-        weight = np.zeros(self._shape(camera), np.float32)
-        by_exposure = sorted(steps, key=lambda s: s.exposure)
-        shortest, clipped = self._unlit_subtracted(by_exposure[0], camera)
-        for step in by_exposure:
-            image, saturated = self._unlit_subtracted(step, camera)
-            used = np.float32(step.exposure) * ~saturated
-            total += used[..., None] * image
-            weight += used
-        merged = total / np.maximum(weight, np.finfo(np.float32).tiny)[..., None]
-        return np.where(weight[..., None] > 0, merged, shortest), clipped
+        steps = sorted(steps, key=lambda s: s.exposure)
+        return averaged((s.exposure, *self._unlit_subtracted(s, camera)) for s in steps)
 
     def _unlit_subtracted(self, step: Step, camera: str) -> Pixels:
         """`response_and_saturated` minus the stray light of the dark frames."""
         image, saturated = self.response_and_saturated(step, camera)
-        stray = self._stray_light(camera, step.exposure)
+        stray = self.stray_light_of(camera, step.exposure)
         if stray is not None:
             image = image - stray / np.float32(step.level or 1.0)
         return image, saturated
 
-    def _stray_light(self, camera: str, exposure: float) -> Floats | None:
-        """Cached for one camera at a time: frames are read camera by camera."""
+    def stray_light_of(self, camera: str, exposure: float) -> Floats | None:
+        """Stray light `(H, W, 3)`, cached for one camera: frames are read camera by camera."""
         steps = self.dark_steps(camera, exposure)
         if self._stray[0] != camera:
             self._stray = camera, {}
@@ -290,9 +274,8 @@ class Capture:
     @cached_property
     def _of_light(self) -> dict[str, list[Step]]:
         out: dict[str, list[Step]] = {}
-        for step in self.of_kind("olat"):
-            assert step.light is not None
-            out.setdefault(step.light, []).append(step)
+        for step in (s for s in self.steps if s.lighting is not None):
+            out.setdefault(str(step.lighting), []).append(step)
         return out
 
     def read_file(self, step: Step, camera: str, read: Callable[[Path], T]) -> T:
@@ -360,9 +343,29 @@ class Capture:
         """Names of the lights with single-light frames, in rig order."""
         return [light.name for light in self.rig.lights if light.name in self._of_light]
 
-    def under_constant_light(self) -> bool:
-        """Whether there are fully lit frames and none of single lights."""
-        return bool(self.of_kind("all_on")) and not self.olat_lights()
+    @cached_property
+    def patterns(self) -> LightPatterns | None:
+        """The patterns of lights of its frames, None without any. Raises `CaptureError`."""
+        names = {str(s.pattern) for s in self.of_kind("pattern")}
+        try:
+            return LightPatterns.of_plan(self.plan, self.rig, names) if names else None
+        except PatternError as error:
+            raise CaptureError(f"{self.path / 'plan.json'}: patterns: {error}") from error
+
+    def lightings(self) -> list[str]:
+        """Names of the single lights with frames, in rig order; without any, of the patterns."""
+        shot = [n for n in self.patterns.names if n in self._of_light] if self.patterns else []
+        return self.olat_lights() or shot
+
+    def lighting(self, name: str) -> Lighting:
+        """A single light or a pattern, by its name."""
+        shot = self.patterns
+        own = shot is not None and name in shot.names
+        return shot.pattern(name, self.rig) if shot and own else self.rig.light(name)
+
+    def without_single_lights(self) -> tuple[Step, ...]:
+        """Without single lights: the frames of texture, fully lit ones, else those of patterns."""
+        return () if self.olat_lights() else self.of_kind("all_on") or self.of_kind("pattern")
 
     def mask(self, camera: str) -> Bools | None:
         """The user's hair mask `(H, W)`, None without one."""
@@ -381,11 +384,8 @@ class Capture:
     @cached_property
     def world(self) -> WorldFrame | None:
         """The frame of the user's cameras, None for a capture of the stage itself."""
-        record = self.plan.get("import")
-        if not isinstance(record, dict) or "frame" not in record:
-            return None
         try:
-            return WorldFrame.from_dict(record["frame"], "import.frame")
+            return WorldFrame.of_plan(self.plan)
         except (TypeError, ValueError) as error:
             raise CaptureError(f"{self.path / 'plan.json'}: {error}") from error
 

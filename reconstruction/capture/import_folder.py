@@ -3,9 +3,11 @@
 folder/
   cameras.json      {"cameras": [{"id", "width", "height", "K", "R", "t"}, ...]}
   lights.json       {"lights": [{"id", "position", "intensity", "colocated_camera"}, ...]}, optional
+  patterns.csv      a table of patterns of lights (`light_patterns`), or patterns.json, optional
   projectors.json   {"projectors": [...]} as in a capture's rig.json, optional
   import.toml       names and encoding of the images (`ImportSettings`), optional
   images/<camera>/<light>.*      the image under that light alone, unless import.toml has a pattern
+  images/<camera>/<pattern>.*    with a table of patterns: the image under that pattern
   images/<camera>.*              without lights.json: the photograph under constant light
   masks/<camera>.png             hair masks, optional
   subjects/<camera>.png          masks of hair, head and body, optional
@@ -21,7 +23,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -52,6 +54,12 @@ from reconstruction.capture.import_tables import (
     own_geometry,
     projectors_of,
     scalp_of,
+)
+from reconstruction.capture.light_patterns import (
+    TABLES,
+    LightPatterns,
+    PatternError,
+    read_patterns,
 )
 from reconstruction.capture.likely_lights import LIKELY
 from reconstruction.capture.records import Step
@@ -100,6 +108,7 @@ class Import:
     undistorted, since a rig cannot store their lens model; `rig` is the capture's; `ball` is a grey
     ball. All of them, `head` and `scalp` (the text of scalp.obj) are relative to `origin`. Results
     come back in the frame and unit `world` of the files. `preset`: the layout is a published set's.
+    `patterns` are those of the images.
     """
 
     folder: Path
@@ -114,6 +123,7 @@ class Import:
     origin: Origin = field(default_factory=Origin)
     world: WorldFrame = field(default_factory=WorldFrame)
     preset: bool = False
+    patterns: LightPatterns | None = None
 
     @classmethod
     def of(
@@ -144,14 +154,16 @@ class Import:
         origin = Origin.of(given.cameras)
         given = origin.rig(given)
         preset = found is not None
-        found = find(folder, settings, given) if found is None else found
+        used = {s.pattern for s in found.steps if s.pattern} if found else ()
+        patterns = _patterns(folder, settings, given, used)
+        found = find(folder, settings, given, patterns) if found is None else found
         alone = notes_on_plates(found, settings.pictures.clean_plate)
         doubts = geometry.notes if own else []
         found = replace(found, notes=(*found.notes, *doubts, *alone, *origin.notes))
         cameras = {c.name: _sized(c, found) for c in given.cameras}
         lenses = {n: Lens.of(c) for n, c in cameras.items() if isinstance(c, LensModelCamera)}
         kept = tuple(lenses[n].undistorted if n in lenses else c for n, c in cameras.items())
-        lit = {s.light for s in found.steps}
+        lit = {s.light for s in found.steps} | set(patterns.lights if patterns else ())
         rig = replace(given, cameras=kept, lights=tuple(x for x in given.lights if x.name in lit))
         placement = geometry.placement
         world = WorldFrame(metres(placement.unit), placement.up or "z")
@@ -169,7 +181,7 @@ class Import:
         return cls(
             folder, settings, rig, cameras, lenses, found, origin.head(head), ball,
             None if scalp is None else origin.obj(scalp), origin,
-            replace(world, origin=origin.stored), preset,
+            replace(world, origin=origin.stored), preset, patterns,
         )  # fmt: skip
 
     @property
@@ -194,7 +206,7 @@ class Import:
         return self._reader(replace(self.settings, sensor=self.response.sensor))
 
     def _reader(self, settings: ImportSettings) -> ImportedFrames:
-        return ImportedFrames(settings, self.shot, self.found, self.rig, self.ball)
+        return ImportedFrames(settings, self.shot, self.found, self.rig, self.ball, self.patterns)
 
     def counts(self) -> dict[str, Any]:
         """What was recognised, as numbers."""
@@ -259,6 +271,8 @@ class Import:
         frame = self.world.to_dict()
         record = {"notes": notes, "relative": reader.relative, "frame": frame}
         plan = {"steps": self.found.steps, "imported_from": self.folder.name, "import": record}
+        if self.patterns is not None:
+            plan["patterns"] = self.patterns.to_dict()
         writer = CaptureWriter.create(
             out, replace(self.rig, lights=lights), plan,
             masks=self._undistorted(masks), head=self.head,
@@ -310,6 +324,29 @@ class Import:
             "noise": lens.undistort(merged.noise),
         }
         return Merged(**vars(merged) | images)
+
+
+def _patterns(
+    folder: Path, settings: ImportSettings, rig: Rig, used: Collection[str]
+) -> LightPatterns | None:
+    """The table of the settings or the folder with the patterns `used`, None without a table."""
+    named = [p for p in (settings.patterns, *TABLES) if p is not None]
+    tables = [folder / p for p in named if settings.patterns == p or (folder / p).is_file()]
+    if not tables:
+        if used:
+            raise ImportProblem(
+                f"{folder}: each image is lit by a pattern of many lamps: give a table of their "
+                f"weights (--patterns FILE) with the rows {', '.join(sorted(used))}, or import "
+                "images of single lights"
+            )
+        return None
+    try:
+        found = read_patterns(tables[0], [x.name for x in rig.lights])
+    except PatternError as error:
+        raise ImportProblem(str(error)) from error
+    if missing := sorted(set(used) - set(found.names)):
+        raise ImportProblem(f"{tables[0]}: no row of the pattern {missing[0]}")
+    return found
 
 
 def _sized(camera: Camera, found: Found) -> Camera:

@@ -15,6 +15,7 @@ from reconstruction.capture.exposures import BackgroundPixels, Merged, flattened
 from reconstruction.capture.grey_ball import PlacedBall, Scale
 from reconstruction.capture.import_matching import Bracket, Found
 from reconstruction.capture.import_settings import ImportProblem, ImportSettings
+from reconstruction.capture.light_patterns import LightPatterns
 from reconstruction.capture.likely_lights import likely_strength
 from reconstruction.capture.records import Step
 from reconstruction.files.encoded import PictureError
@@ -42,6 +43,7 @@ class ImportedFrames:
     found: Found
     rig: Rig
     ball: PlacedBall | None = None
+    patterns: LightPatterns | None = None
 
     @property
     def relative(self) -> bool:
@@ -94,18 +96,22 @@ class ImportedFrames:
         """Factor on the lights' intensities for images in relative units, else 1."""
         if not self.relative or self.settings.scale != 1:
             return 1.0
+        pattern = self.patterns.pattern if self.patterns else lambda name, rig: rig.light(name)
         return likely_strength(
-            (self.rig.light(str(s.light)), self.frame(self.found.frames[s.index, c], c).radiance)
-            for s, c in self._sample(self.shot)
+            (
+                pattern(str(s.lighting), self.rig),
+                self.frame(self.found.frames[s.index, c], c).radiance,
+            )
+            for s, c in self._sample(self.shot, "pattern" if self.patterns else "olat")
         )
 
-    def _sample(self, cameras: Iterable[str]) -> list[tuple[Step, str]]:
-        """`SAMPLED_FRAMES` random single-light frames of these cameras: every n-th frame would
+    def _sample(self, cameras: Iterable[str], kind: str = "olat") -> list[tuple[Step, str]]:
+        """`SAMPLED_FRAMES` random frames of one kind of these cameras: every n-th frame would
         always be of the same camera."""
         frames = [
             (step, camera)
             for step, camera in product(self.found.steps, cameras)
-            if step.kind == "olat" and (step.index, camera) in self.found.frames
+            if step.kind == kind and (step.index, camera) in self.found.frames
         ]
         order = np.random.default_rng(0).permutation(len(frames))
         return [frames[k] for k in order[:SAMPLED_FRAMES]]

@@ -12,11 +12,13 @@ from typing import Any, get_args
 
 from reconstruction.capture.import_settings import (
     FIELDS,
+    PATTERN_IMAGES,
     PHOTOGRAPHS,
     ImportProblem,
     ImportSettings,
     Patterns,
 )
+from reconstruction.capture.light_patterns import LightPatterns
 from reconstruction.capture.records import Step, StepKind
 from reconstruction.files.encoded import FORMATS, RAW, PictureError
 from reconstruction.files.pictures import LOSSY, exposure_of
@@ -51,6 +53,7 @@ class _Match:
     path: Path
     camera: str
     light: str | None
+    pattern: str | None
     projector: str | None
     row: int | None
     number: int | None
@@ -60,20 +63,24 @@ class _Match:
     def shot(self) -> tuple[Any, ...]:
         """Identifies a step over cameras and exposures; sorts by time."""
         order = -1 if self.number is None else self.number
-        return order, self.projector or "", -1 if self.row is None else self.row
+        row = -1 if self.row is None else self.row
+        return order, self.projector or "", row, self.pattern or ""
 
 
-def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
-    """Match all files in `folder` with the patterns and the names in `rig`.
+def find(
+    folder: Path, settings: ImportSettings, rig: Rig, lit_by: LightPatterns | None = None
+) -> Found:
+    """Match all files in `folder` with the patterns and the names in `rig` and `lit_by`.
 
-    Raises `ImportProblem` for an invalid pattern, no single-light image (or, for a rig without
-    lights, no photograph), two files for one frame, or rows without an order among tracking frames.
+    Raises `ImportProblem` for an invalid pattern, no single-light image (for a rig without lights,
+    no photograph; with `lit_by`, no image under a pattern), two files for one frame, or rows
+    without an order among tracking frames.
     """
     names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
-    reader, needed = _Names(rig, settings), "olat" if rig.lights else "all_on"
-    patterns = (
-        settings.pictures if rig.lights else _of_photographs(settings.pictures, reader, names)
-    )
+    reader, needed, patterns = _Names(rig, settings, lit_by), "olat", settings.pictures
+    if lit_by is not None or not rig.lights:
+        needed, places = ("all_on", PHOTOGRAPHS) if lit_by is None else ("pattern", PATTERN_IMAGES)
+        patterns = _first_of(places, patterns, reader, names)
     matches: dict[str, list[_Match]] = {}
     used: set[Path] = set()
     for role in (f for f in vars(patterns) if getattr(patterns, f)):
@@ -94,11 +101,12 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
             else:
                 groups[match.shot].append(match)
         kinds += [(kind, key, group) for key, group in groups.items()]
-    rank = {"dark": 0, "all_on": 1, "olat": 2, "tracking": 3, "scanline": 3}
+    rank = {"dark": 0, "all_on": 1, "olat": 2, "pattern": 2, "tracking": 3, "scanline": 3}
     for kind, _, group in sorted(kinds, key=lambda k: (rank[k[0]], k[1], k[0])):
         first, longest = group[0], max(m.exposure for m in group)
         level = 0.0 if kind == "dark" else 1.0
         which = {"light": first.light, "projector": first.projector, "row": first.row}
+        which |= {"pattern": first.pattern}
         step = Step(len(steps), kind, longest, level, **which)  # type: ignore[arg-type]
         steps.append(step)
         for camera, bracket in _brackets(group).items():
@@ -114,7 +122,7 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
         for role in ("flat", "hair", "subject")
     }
     left = [n for n, p in names.items() if p not in used and p.suffix.lower() in FORMATS]
-    shot = {s.light for s in steps}
+    shot = {s.light for s in steps} | set(lit_by.lights if lit_by else ())
     without = sorted({c.name for c in rig.cameras} - {camera for _, camera in frames})
     bare = [f"{_few(without)}: no images, all frames are missing"] if without else []
     return Found(
@@ -123,14 +131,20 @@ def find(folder: Path, settings: ImportSettings, rig: Rig) -> Found:
     )  # fmt: skip
 
 
-def _of_photographs(patterns: Patterns, reader: _Names, names: Mapping[str, Path]) -> Patterns:
-    """`patterns` of a set without lights: defaults become the first of `PHOTOGRAPHS` that match."""
+def _first_of(
+    defaults: Mapping[str, Sequence[str]],
+    patterns: Patterns,
+    reader: _Names,
+    names: Mapping[str, Path],
+) -> Patterns:
+    """`patterns` of a set without single lights: `defaults` become the first that match."""
     chosen = {}
-    for role, places in PHOTOGRAPHS.items():
+    for role, places in defaults.items():
         if getattr(patterns, role) == getattr(Patterns(), role):
             matching = (p for p in places if reader.matching(role, p, names))
             chosen[role] = next(matching, places[0])
-    return replace(patterns, olat="", **chosen)
+    stated = reader.lights and patterns.olat != Patterns().olat
+    return replace(patterns, **chosen) if stated else replace(patterns, olat="", **chosen)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -220,9 +234,10 @@ def _few(names: Sequence[str]) -> str:
 class _Names:
     """The names of a rig in file names."""
 
-    def __init__(self, rig: Rig, settings: ImportSettings) -> None:
+    def __init__(self, rig: Rig, settings: ImportSettings, lit_by: LightPatterns | None) -> None:
         self.cameras = [c.name for c in rig.cameras]
         self.lights = [x.name for x in rig.lights]
+        self.patterns = list(lit_by.names) if lit_by else []
         self.projectors = [p.name for p in rig.projectors]
         self._settings = settings
         self.sensitivities: set[str] = set()
@@ -230,6 +245,7 @@ class _Names:
     def matching(self, role: str, pattern: str, names: Mapping[str, Path]) -> list[_Match]:
         """Files matching `pattern`. Raises `ImportProblem` if a required field is missing."""
         needed = {"olat": {"camera", "light"}, "scanline": {"camera", "projector", "row"}}
+        needed["pattern"] = {"camera", "pattern"}
         given = {"camera": self.cameras, "projector": self.projectors}
         fields = set(re.findall(r"{(.*?)}", pattern))
         where = f"pictures.{role} = {pattern!r}"
@@ -251,6 +267,7 @@ class _Names:
         kinds = {
             "camera": _any_of([*self.cameras, _numbered("cam(?:era)?", self.cameras)], 1),
             "light": _any_of([*self.lights, _numbered("light", self.lights)], 1),
+            "pattern": _any_of([*self.patterns, _numbered("pattern", self.patterns)], 1),
             "projector": _any_of([*self.projectors, _numbered("proj", self.projectors)], 1),
             "exposure": _any_of(
                 [*self._settings.exposures, r"\d+[-_]\d+|\d+(?:\.\d+)?(?:e-?\d+)?"], 1
@@ -278,12 +295,15 @@ class _Names:
             else self.cameras[0]
         )
         light = self._light(fields["light"]) if "light" in fields else None
+        pattern = self._name(fields.get("pattern"), self.patterns)
         projector = self._name(fields.get("projector"), self.projectors)
         if "row" in fields and "projector" not in fields:
             projector = self.projectors[0]
         if camera is None or (light is None and "light" in fields):
             return None
-        if projector is None and "projector" in fields:
+        if any(
+            x is None and f in fields for f, x in (("pattern", pattern), ("projector", projector))
+        ):
             return None
         row, number = (int(fields[f]) if f in fields else None for f in ("row", "number"))
         exposure = self._settings.exposure
@@ -291,7 +311,7 @@ class _Names:
             exposure = self._seconds(fields["exposure"])
         elif exposure == "file":
             exposure = self._seconds_in(path) if timed else 1.0
-        return _Match(path, camera, light, projector, row, number, exposure)
+        return _Match(path, camera, light, pattern, projector, row, number, exposure)
 
     def _light(self, text: str) -> str | None:
         first, number = self._settings.first_light, re.search(r"\d+$", text)
@@ -346,6 +366,7 @@ class _Names:
         if not pictures:
             return f"{folder}: no images ({' '.join(sorted(FORMATS))})"
         lights = f" and a light of {_few(self.lights)}" if self.lights else ""
+        lights = f" and a pattern of {_few(self.patterns)}" if self.patterns else lights
         way = "" if lights else ", or lights (lights.json, --lights) if each shows one"
         return (
             f"{folder}: no file matches {pattern!r} with a camera of {_few(self.cameras)}{lights}; "

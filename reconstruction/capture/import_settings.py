@@ -14,7 +14,7 @@ from reconstruction.files.pictures import Positive, Sensor
 from reconstruction.options import BadOptions, options, parse_options
 
 SETTINGS = "import.toml"
-FIELDS = ("camera", "light", "exposure", "projector", "row", "number")
+FIELDS = ("camera", "light", "pattern", "exposure", "projector", "row", "number")
 
 
 class ImportProblem(CaptureError):
@@ -25,18 +25,20 @@ class ImportProblem(CaptureError):
 class Patterns:
     """File name patterns of each kind of image, relative to the folder.
 
-    `{camera}`, `{light}` and `{projector}` are names, or the number at the end of a name with any
-    zeros before it (7, 07, light_07); `{exposure}` is seconds (`0.02`, `1-50`) or a key of
-    `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for tracking
+    `{camera}`, `{light}`, `{pattern}` and `{projector}` are names, or the number at the end of a
+    name with any zeros before it (7, 07, light_07); `{exposure}` is seconds (`0.02`, `1-50`) or a
+    key of `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for tracking
     frames and rows (lights captured once may be counted per camera); `*` is any text.
-    `clean_plate` shows the stage without the subject, `flat` an evenly lit field. Without lights
-    `olat` is not used, and `all_on`, `hair` and `subject` default to the first of `PHOTOGRAPHS`
-    that match a file.
+    `clean_plate` shows the stage without the subject, `flat` an evenly lit field. Without lights,
+    and with a table of patterns of lights, the default `olat` is not used. Without lights `all_on`,
+    `hair` and `subject` default to the first of `PHOTOGRAPHS` that match a file, with a table
+    `pattern` to the first of `PATTERN_IMAGES`.
     """
 
     olat: str = "images/{camera}/{light}.*"
     dark: str | None = None
     all_on: str | None = None
+    pattern: str | None = None
     tracking: str | None = None
     scanline: str | None = None
     clean_plate: str | None = None
@@ -45,6 +47,7 @@ class Patterns:
     subject: str = "subjects/{camera}.png"
 
 
+PATTERN_IMAGES = {"pattern": ("images/{camera}/{pattern}.*", "images/{pattern}/{camera}.*")}
 PHOTOGRAPHS = {
     "all_on": ("images/{camera}.*", "images_2/{camera}.*", "image/{camera}.*"),
     "hair": (
@@ -68,7 +71,9 @@ class ImportSettings:
     `exposures` are named exposures. `first_light` is the number in a file name of the first light
     in the list; None: numbers are those at the end of the lights' names. `units` is whether a full
     channel at 1 s is `scale` W/(sr m²) or unknown; a `grey_ball` determines it instead of `scale`.
-    `geometry` are the files of cameras and lights, relative to the folder.
+    `patterns` is a table of `reconstruction.capture.light_patterns`, by default the folder's
+    patterns.csv or patterns.json; it and the files of cameras and lights, `geometry`, are relative
+    to the folder.
     """
 
     pictures: Patterns = Patterns()
@@ -79,6 +84,7 @@ class ImportSettings:
     units: Literal["radiance", "relative"] | None = None
     scale: Positive = 1.0
     grey_ball: GreyBall | None = None
+    patterns: Path | None = None
     geometry: GeometryFiles = GeometryFiles()
 
 

@@ -7,26 +7,25 @@ from collections.abc import Iterable
 import numpy as np
 
 from reconstruction.arrays import Floats
-from reconstruction.geometry.lights import Light
+from reconstruction.geometry.lights import Lighting
 
 LIKELY = 0.2
 """Assumed reflectance of a head; measured for brown hair and fair skin: 0.18."""
 _BRIGHTEST = 98.0  # percentile of lit pixels at which highlights and noise are clipped
 
 
-def likely_strength(shown: Iterable[tuple[Light, Floats]]) -> float:
+def likely_strength(shown: Iterable[tuple[Lighting, Floats]]) -> float:
     """Factor on the lights' intensities; 1 if all images are dark.
 
-    `shown` are lights and images `(H, W, 3)` under each alone, in any unit. The reflectance of an
-    image is its radiance over that of a white matte surface at the origin facing the light,
+    `shown` are lights or patterns, and images `(H, W, 3)` under each, in any unit. The reflectance
+    of an image is its radiance over that of a white matte surface at the origin facing the light,
     averaged with itself as weight, so that a dark background does not count. The median over images
     is used, since lights behind and in front of the head differ.
     """
     found = []
     for light, image in shown:
         grey = np.maximum(image.mean(axis=-1, dtype=float), 0)
-        squared = float(light.position @ light.position)
-        white = float(light.intensity_towards(np.zeros(3)).mean()) / max(squared, 1e-12) / np.pi
+        white = float(light.irradiance(np.zeros(3)).mean()) / np.pi
         if white > 0 and grey.any():
             grey = np.minimum(grey, np.percentile(grey[grey > 0.02 * grey.max()], _BRIGHTEST))
             found.append((grey**2).sum() / grey.sum() / white)

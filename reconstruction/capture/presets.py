@@ -53,7 +53,7 @@ HATCH = (
 
 @dataclass(frozen=True)
 class TakeFrame:
-    """One file: kind of step, `light` (single lights only), and `number` in the take."""
+    """One file: kind of step, `light` (single lights) or pattern, and `number` in the take."""
 
     kind: StepKind
     number: int
@@ -109,6 +109,7 @@ def understood(take: Take) -> tuple[ImportSettings, Found]:
     keys = sorted(rank, key=lambda k: (k[0], k[1], k[2] or ""))
     seconds = take.exposure
     steps = [Step(i, kind, seconds, light=light) for i, (_, kind, light) in enumerate(keys)]
+    steps = [replace(s, light=None, pattern=s.light) if s.kind == "pattern" else s for s in steps]
     at = {key: i for i, key in enumerate(keys)}
     frames = {(at[f.number, f.kind, f.light], f.camera): {seconds: f.path} for f in take.frames}
     settings = ImportSettings(sensor=take.sensor, units="relative")
@@ -228,7 +229,8 @@ def _humanolat(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take
 
 def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) -> Take:
     """`OLAT/NAME`: `Lights/NNN/raw_undistorted/CAMERA.JPG`, whose light is row NNN of the set's
-    `light_pos.npy`; `output/transforms_*.json`; masks `output/obj_masks/CAMERA.png`.
+    `light_pos.npy`; `output/transforms_*.json`; masks `output/obj_masks/CAMERA.png`. In
+    `lighting_patterns/NAME` each is under a pattern, whose weights the set does not have.
     """
     folder = files.folder
     tables = sorted((folder / "output").glob("transforms_*.json"))
@@ -238,13 +240,9 @@ def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) 
         raise PresetProblem(
             f"{folder}: expected output/transforms_train.json and Lights/000/raw_undistorted/A1.JPG"
         )
-    if set(lit) <= PATTERNS or folder.parent.name == "lighting_patterns":
-        raise PresetProblem(
-            f"{folder}: each image is lit by a pattern of many lamps, single lights are needed: "
-            "download the object with --light OLAT (20 of the 64 objects have it)"
-        )
+    of_patterns = set(lit) <= PATTERNS or folder.parent.name == "lighting_patterns"
     lights = read_lights(_given(files.lights or _above(folder, "light_pos.npy"), "--lights FILE"))
-    if max(lit) >= len(lights.lights):
+    if max(lit) >= len(lights.lights) and not of_patterns:
         raise PresetProblem(
             f"{folder}: Lights/{max(lit):03d} is beyond the {len(lights.lights)} lights of the file"
         )
@@ -267,11 +265,13 @@ def _openillumination(files: PresetFiles, mean: Mean, given: Mapping[str, Any]) 
         geometry.notes.append(f"{tables[0]} has no unit: m is assumed (--unit)")
     if without := sorted(set(pictures) - set(geometry.cameras)):
         geometry.notes.append(f"{', '.join(without)}: no pose, skipped")
-    names = [light.name for light in geometry.lights]
-    if dark := [name for n, name in enumerate(names) if not shot.get(n)]:
+    names = dict(enumerate(light.name for light in geometry.lights))
+    if of_patterns:
+        names = {n: f"{n:03d}" for n in lit}
+    elif dark := [name for n, name in names.items() if not shot.get(n)]:
         geometry.notes.append(f"{len(dark)} lights have no image and are skipped: {dark[0]}, …")
     single = [
-        TakeFrame("olat", n, camera, path, names[n])
+        TakeFrame("pattern" if of_patterns else "olat", n, camera, path, names[n])
         for n, taken in shot.items()
         for camera, path in taken.items()
         if camera in geometry.cameras

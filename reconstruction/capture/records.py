@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from reconstruction.containment import plain_file
 from reconstruction.reading import parse_json, read_json
 
-StepKind = Literal["dark", "all_on", "olat", "scanline", "tracking"]
+StepKind = Literal["dark", "all_on", "olat", "pattern", "scanline", "tracking"]
 
 
 class CaptureError(ValueError):
@@ -24,8 +24,8 @@ class MissingFrame(CaptureError):
 class Step:
     """One commanded exposure of all cameras.
 
-    `level`, 0 to 1, scales the lights (`olat`, `all_on`) or projectors (`scanline`, `tracking`: all
-    projectors on); `exposure` is in seconds.
+    `level`, 0 to 1, scales the lights (`olat`, `all_on`, `pattern`) or projectors (`scanline`,
+    `tracking`: all projectors on); `exposure` is in seconds.
     """
 
     index: int
@@ -35,6 +35,12 @@ class Step:
     light: str | None = None
     projector: str | None = None
     row: int | None = None
+    pattern: str | None = None
+
+    @property
+    def lighting(self) -> str | None:
+        """The single light or the pattern of a frame."""
+        return self.light if self.kind == "olat" else self.pattern
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Step:

@@ -50,7 +50,8 @@ def check_response(frames: ImportedFrames, replaceable: bool) -> ResponseCheck:
     sensor, found = frames.settings.sensor, frames.found
     singles = [s for s in found.steps if s.kind == "olat"]
     if not singles:  # the curve is irrelevant to the texture of photographs
-        return ResponseCheck(sensor, ())
+        taken = "images are under patterns: the response curve is not checked by their sums"
+        return ResponseCheck(sensor, (taken,) if frames.patterns else ())
     kinds = {"all_on"} if frames.rig.projectors else {"all_on", "tracking"}
     lit = [s for s in found.steps if s.kind in kinds]
 

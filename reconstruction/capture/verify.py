@@ -9,7 +9,7 @@ from pathlib import Path
 
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.records import CaptureError, FrameRecord
-from reconstruction.capture.writer import sha256
+from reconstruction.capture.writer import sha256, unlisted_files
 from reconstruction.containment import inside
 from reconstruction.files.exr import read_exr
 from reconstruction.report.report import Progress, silent
@@ -103,7 +103,7 @@ def _left_over(path: Path) -> Iterator[str]:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return
-        unlisted = [str(p.relative_to(path)) for p in Capture(path).unlisted_files()]
+        unlisted = [str(p.relative_to(path)) for p in unlisted_files(Capture(path))]
     if unlisted:
         yield (
             f"{len(unlisted)} files under frames/ are not listed in the journal, as after an "

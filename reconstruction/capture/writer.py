@@ -148,7 +148,7 @@ class CaptureWriter:
         journal = open_journal(Path(path))
         capture = Capture(path)
         (capture.path / "manifest.json").unlink(missing_ok=True)
-        for left_over in capture.unlisted_files():
+        for left_over in unlisted_files(capture):
             if left_over.suffix == ".exr":  # possibly incomplete
                 left_over.unlink()
         return cls(capture, journal)
@@ -319,6 +319,12 @@ class CaptureWriter:
             raise CaptureError(f"step {step.index}: {step} is not in this capture's plan")
         if self._has(step, self.rig.camera(camera)):
             raise CaptureError(f"step {step.index}, {camera}: this frame is already written")
+
+
+def unlisted_files(capture: Capture) -> list[Path]:
+    """Files under frames/ that no line of the journal names: leftovers of a crash."""
+    known = {capture.path / r.file for r in capture.records.values() if r.file is not None}
+    return sorted(p for p in capture.path.glob("frames/**/*") if p.is_file() and p not in known)
 
 
 def open_journal(path: Path) -> FileIO:

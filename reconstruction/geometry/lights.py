@@ -1,7 +1,8 @@
-"""The stage's lights: points, small spheres, rectangles, with or without a profile."""
+"""The stage's lights: points, small spheres, rectangles, with or without a profile; patterns."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,6 +79,15 @@ class Light:
                 share = share * (cosine > 0) if self.profile is not None else cosine.clip(0)
         return self.intensity * np.broadcast_to(share, away.shape[:-1])[..., None]
 
+    def irradiance(self, points: ArrayLike) -> Array:
+        """Irradiance `(..., 3)`, W/m², across the ray to world `points (..., 3)`, unshadowed."""
+        squared = np.square(np.asarray(points, float) - self.position).sum(axis=-1)
+        return self.intensity_towards(points) / np.maximum(squared, 1e-12)[..., None]
+
+    def scaled(self, factor: float) -> Light:
+        """The light at `factor` times its intensity."""
+        return replace(self, intensity=self.intensity * factor)
+
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> Light:
         """The light as a subject moved by `x -> rotation (3, 3) @ x + translation (3,)` has it."""
         Q, d = np.asarray(rotation, float), np.asarray(translation, float)
@@ -97,6 +107,53 @@ class Light:
         if self.size is not None:
             out["size"] = list(self.size)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class LightPattern:
+    """Lights that shine together: `weights (K,)` are factors on the intensities of `lights`."""
+
+    name: str
+    lights: tuple[Light, ...]
+    weights: Array
+
+    @property
+    def position(self) -> Array:
+        """Mean position `(3,)` of the lights by weight and brightness, which gives a direction."""
+        strength = self.weights * [x.intensity.mean() for x in self.lights]
+        mean = strength @ [x.position for x in self.lights]
+        return np.asarray(mean / max(strength.sum(), np.finfo(float).tiny))
+
+    def irradiance(self, points: ArrayLike) -> Array:
+        """The sum of the lights' `irradiance (..., 3)` at world `points (..., 3)`."""
+        each = (w * x.irradiance(points) for w, x in zip(self.weights, self.lights, strict=True))
+        return np.asarray(sum(each))
+
+    def scaled(self, factor: float) -> LightPattern:
+        """The pattern at `factor` times its intensity."""
+        return replace(self, weights=factor * self.weights)
+
+
+Lighting = Light | LightPattern
+"""What lights a frame."""
+
+
+def components(lightings: Sequence[Lighting]) -> tuple[list[Light], Array | None]:
+    """The distinct lights (L) of `lightings` (M), and the matrix `(M, L)` whose product with their
+    pictures is that under each lighting; None where each is a light of its own."""
+    lights = {
+        y.name: y for x in lightings for y in (x.lights if isinstance(x, LightPattern) else (x,))
+    }
+    if not any(isinstance(x, LightPattern) for x in lightings):
+        return [x for x in lightings if isinstance(x, Light)], None
+    at = {name: i for i, name in enumerate(lights)}
+    mix = np.zeros((len(lightings), len(lights)))
+    for row, x in zip(mix, lightings, strict=True):
+        if isinstance(x, LightPattern):
+            row[[at[y.name] for y in x.lights]] = x.weights
+        else:
+            row[at[x.name]] = 1.0
+    return list(lights.values()), mix
 
 
 def dome_positions(count: int, radius: float, lowest_deg: float = -90.0) -> Array:

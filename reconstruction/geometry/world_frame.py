@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeVar
 
@@ -64,6 +65,14 @@ class WorldFrame:
     def as_read_from_usd(self) -> WorldFrame:
         """The world of USD files once their unit and up axis are converted to metres and z up."""
         return WorldFrame(1.0, "z" if self.up == self.usd_up else self.up, self.origin)
+
+    @classmethod
+    def of_plan(cls, plan: Mapping[str, Any]) -> WorldFrame | None:
+        """The frame that the plan of an import has. Raises `ValueError` or `TypeError`."""
+        record = plan.get("import")
+        if not isinstance(record, dict) or "frame" not in record:
+            return None
+        return cls.from_dict(record["frame"], "import.frame")
 
     def to_user(self, points: AnyFloats) -> Array:
         """Points `(N, 3)` of the stage in the user's frame and unit."""

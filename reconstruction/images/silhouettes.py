@@ -7,6 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from reconstruction.arrays import AnyFloats, Bools, Floats
+from reconstruction.capture.exposures import averaged
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.records import Step
 from reconstruction.images.grey import grey
@@ -18,7 +19,7 @@ MOST_SATURATED = 0.02
 MOST_LIGHTS = 32  # that are compared with a lit background
 LIKE_BACKGROUND = 1.5  # times its radiance
 SMALLEST = 6  # pixels: smaller specks are noise
-CONSTANT_LIGHT = "the light is constant"
+NO_SINGLE_LIGHTS = "there are no single lights"
 
 
 class NoSilhouette(ValueError):
@@ -94,10 +95,13 @@ def _half_sample_mode(values: AnyFloats) -> float:
 
 
 def lit_frame(capture: Capture, camera: str) -> tuple[Floats, Bools]:
-    """`dark_response` of the camera's first fully lit frame; black and saturated without one."""
-    for step in capture.of_kind("all_on"):
-        if capture.has(step, camera):
-            return dark_response(capture, step, camera)
+    """`dark_response` of the camera's first fully lit frame, or the mean under its patterns; black
+    and saturated without one."""
+    steps = [s for s in capture.without_single_lights() if capture.has(s, camera)]
+    if steps and steps[0].kind == "all_on":
+        return dark_response(capture, steps[0], camera)
+    if steps:
+        return averaged((1.0, *dark_response(capture, s, camera)) for s in steps)
     c = capture.rig.camera(camera)
     return np.zeros((c.height, c.width, 3), np.float32), np.ones((c.height, c.width), bool)
 
@@ -110,12 +114,12 @@ def lit_image(capture: Capture, camera: str) -> Floats:
 def lit_rgb(capture: Capture, camera: str) -> Floats:
     """The subject under all lights minus the dark frame `(H, W, 3)`.
 
-    The all-on frame at full level, else the sum of the OLAT frames, else the first tracking frame;
-    frames with over `MOST_SATURATED` saturated lit pixels come last. Raises `NoSilhouette` without
-    any of them.
+    The all-on frame at full level, else the sum of the OLAT frames or patterns, else the first
+    tracking frame; frames with over `MOST_SATURATED` saturated lit pixels come last. Raises
+    `NoSilhouette` without any of them.
     """
     blown: list[Step] = []
-    for kind, first in (("all_on", True), ("olat", False), ("tracking", True)):
+    for kind, first in (("all_on", True), ("olat", False), ("pattern", False), ("tracking", True)):
         steps = [s for s in capture.steps if s.kind == kind and capture.has(s, camera)]
         if first and steps and _blown(capture, camera, steps[0]):
             blown, steps = blown or steps[:1], []
@@ -123,7 +127,7 @@ def lit_rgb(capture: Capture, camera: str) -> Floats:
             return _sum(capture, camera, steps[:1] if first else steps)
     if blown:
         return _sum(capture, camera, blown)
-    raise NoSilhouette(f"{capture.path}: {camera} has no all_on, olat or tracking frame")
+    raise NoSilhouette(f"{capture.path}: {camera} has no all_on, olat, pattern or tracking frame")
 
 
 def _blown(capture: Capture, camera: str, step: Step) -> bool:

@@ -17,7 +17,7 @@ from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import orientations
 from reconstruction.images.silhouettes import (
-    CONSTANT_LIGHT,
+    NO_SINGLE_LIGHTS,
     lit_frame,
     noise_of_frames,
 )
@@ -87,19 +87,20 @@ def views_of(
 ) -> list[View]:
     """A view for each camera with hair on its mask `hair[name] (H, W)`.
 
-    Frames are scaled to equal irradiance at `subject (3,)`, metres. Under constant light lines come
-    from the fully lit frame and lightcodes are empty. Raises `CaptureError` without either frames,
+    Frames are scaled to equal irradiance at `subject (3,)`, metres. Without single lights lines
+    come from the `lit_frame` and lightcodes are empty. Raises `CaptureError` without either frames,
     or if fewer than two cameras see hair in them.
     """
     stage = stage or Stage("lightcodes")
     names = capture.olat_lights()
-    constant = capture.under_constant_light()
+    steps = capture.without_single_lights()
+    constant = bool(steps)
     if not names and not constant:
         raise CaptureError(
-            f"{capture.path}: no OLAT or fully lit frames, which lines and lightcodes come from"
+            f"{capture.path}: no OLAT, lit or pattern frames, which lines and lightcodes come from"
         )
     cameras = [c for c in capture.rig.cameras if c.name in hair and hair[c.name].any()]
-    steps = capture.of_kind("all_on" if constant else "olat")
+    steps = steps or capture.of_kind("olat")
     unlit = [c.name for c in cameras if not any(capture.has(s, c.name) for s in steps)]
     if unlit:
         stage.warn(f"{', '.join(unlit)}: no lit frame; not used by line stereo")
@@ -122,7 +123,7 @@ def views_of(
         confidence={v.camera.name: float(np.median(v.confidence[v.mask])) for v in views},
     )
     if constant:
-        stage.leave_out("lightcodes", CONSTANT_LIGHT, "visibility and agreement by shadows")
+        stage.leave_out("lightcodes", NO_SINGLE_LIGHTS, "visibility and agreement by shadows")
     elif alone:
         stage.warn(
             f"no light is beside {alone}: their visibility comes from their position, not from "
@@ -163,8 +164,7 @@ def _view(
         if not shot[i]:
             continue
         image, clipped[i] = capture.light(name, camera.name)
-        irradiance = float(light.intensity_towards(at).mean())
-        irradiance /= float(((light.position - at) ** 2).sum())
+        irradiance = float(light.irradiance(at).mean())
         if irradiance <= 0:
             raise CaptureError(
                 f"{capture.path}: the light {name} has no intensity towards {at.tolist()}: check "

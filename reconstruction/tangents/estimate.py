@@ -15,7 +15,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, textures
-from reconstruction.images.silhouettes import CONSTANT_LIGHT, lit_frame
+from reconstruction.images.silhouettes import NO_SINGLE_LIGHTS, lit_frame
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
@@ -88,7 +88,7 @@ def light_groups(lights: list[Light], count: int) -> Ints:
 def read_olat(capture: Capture, camera: Camera, lights: Sequence[str]) -> OlatStack:
     """The frames of `camera` under each of `lights`; missing or saturated pixels are unknown.
 
-    Without lights, its fully lit frame.
+    Without lights, its `lit_frame`.
     """
     if not lights:
         image, saturated = lit_frame(capture, camera.name)
@@ -137,14 +137,14 @@ def measure_tangents(
     """Directions at the triangulated `points (N, 3)`, or without any, at the depths'.
 
     `depths[camera] (H, W)` of the hair pixels are metres along z. Raises `CaptureError` for a
-    capture without OLAT and fully lit frames.
+    capture without OLAT, fully lit and pattern frames.
     """
     stage = stage or Stage("orientation")
     capture = masked.capture
     names = capture.olat_lights()
-    if not names and not capture.under_constant_light():
+    if not names and not capture.without_single_lights():
         raise CaptureError(
-            f"{capture.path}: no OLAT or fully lit frames, which the orientations come from"
+            f"{capture.path}: no OLAT, lit or pattern frames, which the orientations come from"
         )
     lights = [capture.rig.light(n) for n in names]
     group = light_groups(lights, LIGHT_GROUPS)
@@ -183,7 +183,7 @@ def measure_tangents(
     if not reads:
         stage.leave_out(
             "directions from reflection",
-            f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}" if lights else CONSTANT_LIGHT,
+            f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}" if lights else NO_SINGLE_LIGHTS,
             "the second half of this stage; directions come from texture alone",
         )
     else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reconstruction import Capture, MissingFrame, Step
+from reconstruction import Capture, MissingFrame, Step, read_exr
 from reconstruction.arrays import Floats
 from stage_service.devices.errors import IndexShift
 
@@ -41,7 +41,8 @@ def check_sentinels(capture: Capture) -> dict[str, str]:
         difference = b0 - d0
         look = difference >= np.quantile(difference, 1 - BRIGHTEST)
         contrast = float(difference[look].mean())
-        if contrast < LEAST_CONTRAST * capture.count_scale(bright[0], camera.name):
+        attributes = capture.read_file(bright[0], camera.name, read_exr)[1]
+        if contrast < LEAST_CONTRAST * float(attributes.get("countScale", 0.0)):
             unclear[camera.name] = "the lamps make no difference in this camera's picture"
             continue
         shares = [float((x - d0)[look].mean()) / contrast for x in (d1, b1)]

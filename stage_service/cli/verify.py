@@ -1,4 +1,4 @@
-"""`verify` and `import`: capture folders on disk."""
+"""`verify`, `import` and `demultiplex`: capture folders on disk."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def add(commands: Commands) -> None:
     imported.add_argument(
         "--pictures",
         help="paths of the OLAT images: {camera}/{light}.png; default: import.toml's, or "
-        "images/{camera}/{light}.*; without {light}: photographs under constant light",
+        "images/{camera}/{light}.*; without {light}: photographs under constant light; with "
+        "{pattern}: those under patterns",
     )
     imported.add_argument("--settings", type=Path, help="instead of the folder's import.toml")
     imported.add_argument(
@@ -50,6 +51,11 @@ def add(commands: Commands) -> None:
         help="instead of lights.json: positions or directions in .json, .csv, .npy, .mat, .obj",
     )
     imported.add_argument(
+        "--patterns",
+        type=Path,
+        help="instead of patterns.csv: weights of the lights in each pattern, in .csv or .json",
+    )
+    imported.add_argument(
         "--light-distance", type=float, help="metres; for lights given as directions"
     )
     unit = "m, cm, mm, inch, or its length in metres"
@@ -65,6 +71,10 @@ def add(commands: Commands) -> None:
     presets = ("faceolat", "humanolat", "openillumination")
     imported.add_argument("--preset", choices=presets, help="layout of this published data set")
     imported.add_argument("--take", help="of --preset faceolat: ID20001")
+
+    single = add_command(commands, "demultiplex", run_demultiplex, interrupted=remains)
+    single.add_argument("capture", type=Path, help="the capture of patterns of lights")
+    single.add_argument("--out", type=Path, required=True, help="new capture folder")
 
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
@@ -121,6 +131,35 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     output.result({"capture": str(args.out), **counts, "notes": [*notes, *doubts]}, text)
 
 
+def run_demultiplex(args: argparse.Namespace, output: Output) -> None:
+    """Turn a capture of patterns into one of single lights.
+
+    Least squares, where the patterns determine each light; prints how much noise this costs.
+    """
+    from reconstruction import Capture
+    from reconstruction.capture.demultiplexing import demultiplex
+
+    with progress_bar("demultiplex") as progress:
+        found = demultiplex(Capture(args.capture), args.out, progress)
+    for note in found.notes:
+        output.note(f"warning: {note}")
+    solution, gains = found.solution, {}
+    lines = [
+        f"{args.out}: {len(solution.read_gain)} single lights of {len(solution.weights)} patterns"
+    ]
+    for kind in ("read", "photon"):
+        gain = getattr(solution, f"{kind}_gain")
+        gains[f"{kind}_noise_gain"] = gain.tolist()
+        lines.append(
+            f"{kind} noise: {gain.mean():.2f} times a single frame's, at most {gain.max():.2f}"
+        )
+    lines.append(f"condition number: {solution.condition:.3g}")
+    if found.misfit is not None:
+        lines.append(f"frames differ from the sums by {found.misfit:.2%}")
+    data = {"condition": solution.condition, "misfit": found.misfit, "notes": found.notes, **gains}
+    output.result({"capture": str(args.out), **data}, "\n".join(lines))
+
+
 def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     """The import of the folder, and notes for the user."""
     from dataclasses import replace
@@ -134,6 +173,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
 
     if not args.folder.is_dir():
         raise BadArgument(f"{args.folder}: no such folder: name the folder of the images")
+    table = None if args.patterns is None else args.patterns.resolve()
     where = {f: getattr(args, f) for f in ("unit", "light_unit", "up", "camera_axes")}
     given = {f: value for f, value in where.items() if value is not None}
     if args.take is not None and args.preset != "faceolat":
@@ -148,6 +188,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         of_set = PresetFiles(args.folder, args.take, args.cameras, args.lights)
         take = read_preset(args.preset, of_set, mean_light, given)
         settings, found = understood(take)
+        settings = replace(settings, patterns=table)
         imported = Import.of(args.folder, take.geometry, settings, found)
         return imported, [*take.geometry.notes, *imported.found.notes]
     settings = settings_of(args.folder, args.settings)
@@ -165,8 +206,11 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         geometry = read_geometry(files)
     else:
         geometry = own_geometry(args.folder, files.placement, files)
+    if table is not None:
+        settings = replace(settings, patterns=table)
     if args.pictures is not None:
         role = "olat" if "{light}" in args.pictures or geometry.lights else "all_on"
+        role = "pattern" if "{pattern}" in args.pictures else role
         patterns = replace(settings.pictures, **{role: args.pictures})
         settings = replace(settings, pictures=patterns)
     imported = Import.of(args.folder, geometry, settings)

@@ -61,9 +61,7 @@ def dose_of(
     By the inverse-square law; a light is on `overhead_s` longer than its exposure. A row counts as
     1/height of its projector.
     """
-    lamps = {
-        x.name: x.intensity_towards(np.zeros(3)) / (x.position @ x.position) for x in rig.lights
-    }
+    lamps = {x.name: x.irradiance(np.zeros(3)) for x in rig.lights}
     beams = {p.name: (p.intensity / (p.center @ p.center), p.height) for p in rig.projectors}
     all_lamps = sum(lamps.values(), np.zeros(3))
     all_beams = sum((beam for beam, _ in beams.values()), np.zeros(3))

@@ -89,7 +89,7 @@ def test_photographs_become_strands_and_a_groom(
     assert f"{COUNT} photographs under constant light" in capsys.readouterr().err
     report = Report.load(Path(model) / "report.json")
     assert {x.what for x in report["lightcodes"].left_out} == {"lightcodes"}
-    assert "the light is constant" in {x.why for x in report["orientation"].left_out}
+    assert "there are no single lights" in {x.why for x in report["orientation"].left_out}
     assert set(report["masks"].figures["source"].values()) == {"user"}
 
     # along the hair, near the surface, where the hair mask is

@@ -109,7 +109,7 @@ def test_dark_frames_are_read_once_a_camera_and_exposure(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Capture, "frame", frame)
     for exposure in (0.02, 0.5, 0.02, 0.4):
-        assert capture._stray_light("cam_0", exposure).max() == pytest.approx(
+        assert capture.stray_light_of("cam_0", exposure).max() == pytest.approx(
             0.05 if exposure < 0.1 else 0.45
         )
     assert read == [0, 1]
