@@ -9,6 +9,7 @@ import numpy as np
 
 from reconstruction import Camera, Capture, CaptureError, Light, Model, ModelError
 from reconstruction.arrays import Array, Bools, Floats, Ints
+from reconstruction.geometry.lights import Lighting
 
 
 @dataclass(frozen=True)
@@ -26,13 +27,13 @@ class HeldOut:
         capture.view(cameras=self.cameras)  # raises for unknown names
         out = capture.without_lights(self.lights)
         cameras = [c.name for c in capture.rig.cameras if c.name not in self.cameras]
-        if capture.under_constant_light():
+        if capture.without_single_lights() and not capture.lightings():
             raise CaptureError(
                 f"{capture.path}: photographs under constant light do not determine the hair's "
                 "appearance: capture an image under each of several lights of known position "
                 "(docs/how-to/import.md), or export the strands without a fit"
             )
-        for kind, left in (("camera", cameras), ("light", out.olat_lights())):
+        for kind, left in (("camera", cameras), ("light", out.lightings())):
             if not left:
                 raise CaptureError(f"{capture.path}: every {kind} is held out or none was shot")
         return out.view(cameras=cameras)
@@ -40,17 +41,22 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """One camera's pixels under single lights.
+    """One camera's pixels under single lights, or patterns of them.
 
     `pixels (P,)` are flat indices; `radiance (L, P, 3)` in W/(sr m²) at full level; `valid
     (L, P)` is false where the frame is missing or saturated.
     """
 
     camera: Camera
-    lights: tuple[Light, ...]
+    lights: tuple[Lighting, ...]
     pixels: Ints
     radiance: Floats
     valid: Bools
+
+    @property
+    def single_lights(self) -> tuple[Light, ...]:
+        """Those of the lights that are no patterns."""
+        return tuple(x for x in self.lights if isinstance(x, Light))
 
     def where(self, pixels: Bools | Ints) -> Observed:
         """The same lights at some of the pixels, marked by `pixels (P,)`, or by their places."""
@@ -83,7 +89,7 @@ def observe(capture: Capture, camera: str, lights: Sequence[str], pixels: Ints) 
         valid[i] = ~saturated.ravel()[pixels]
     return Observed(
         capture.rig.camera(camera),
-        tuple(capture.rig.light(name) for name in lights),
+        tuple(capture.lighting(name) for name in lights),
         pixels,
         radiance,
         valid,
@@ -118,7 +124,8 @@ def far_apart(positions: Array, most: int) -> list[int]:
 
     The distance is the angle about the origin.
     """
-    towards = positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    away = np.linalg.norm(positions, axis=1, keepdims=True)
+    towards = positions / np.maximum(away, np.finfo(float).tiny)
     chosen = [0]
     nearest = towards @ towards[0]
     while len(chosen) < min(most, len(positions)):

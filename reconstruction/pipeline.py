@@ -165,8 +165,8 @@ class _Run:
         """Strands along the smooth field of the hull's surface and all measured lines.
 
         Single lights, photographs under constant light or patterns give directions, and line
-        stereo if pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without a head no
-        strand has a root.
+        stereo if pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without
+        a head no strand has a root.
         """
         o, capture, report = self.stages.options, masked.capture, self.stages.report
         lit = bool(capture.olat_lights() or capture.without_single_lights())

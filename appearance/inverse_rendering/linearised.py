@@ -17,6 +17,7 @@ from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.render.cached_paths import CachedPaths, Scattering
 from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
+from reconstruction.geometry.lights import mixed
 
 SCALARS = ("beta_m", "beta_n", "eta")
 SHARED = ("sigma_a", *SCALARS)
@@ -64,10 +65,11 @@ class Cells:
 
 
 class LinearisedPictures:
-    """Images `(2, L, P, 3)` of either half of the `paths`, with `maps` on the hair.
+    """Images `(2, L, P, 3)` of either half of the `paths`, with `maps` on the hair; of patterns,
+    one for each.
 
-    `intensities (L, 3)` of the lights are in scene units, images in theirs. Derivatives are those
-    by `names`, of `SHARED` and "rotation".
+    `intensities (L, 3)` of the single lights are in scene units, images in theirs. Derivatives are
+    those by `names`, of `SHARED` and "rotation".
     """
 
     def __init__(
@@ -112,6 +114,8 @@ class LinearisedPictures:
     def rotation_gradient(self, weight: Array, shape: tuple[int, int, int]) -> Array:
         """By the correctives `(n_c, w, h, 2)` of `shape`: the derivative of the sum of `weight (2,
         L, P, 3)` times the pictures, of the first hit's light."""
+        mix = self._paths.mix
+        weight = weight if mix is None else mixed(mix.T, weight, axis=1)
         light = self._light * np.where(self._first, weight.reshape(-1, 3)[self._index], 0)
         values = (light[..., None] * self._lit["rotation"]).sum(axis=1)
         found = self._cells.gathered(values, self._paths.lit.vertex, int(np.prod(shape)))
@@ -146,7 +150,8 @@ class LinearisedPictures:
         size = 2 * self._paths.lights * self._paths.pixels
         sums = [np.bincount(self._index, values[:, k], size) for k in range(3)]
         film: Array = np.stack(sums, axis=-1, dtype=np.float64)
-        return film.reshape(2, self._paths.lights, self._paths.pixels, 3)
+        film = film.reshape(2, self._paths.lights, self._paths.pixels, 3)
+        return np.asarray(mixed(self._paths.mix, film, axis=1))
 
     def _scattered(self, maps: HairMaps, which: Scattering) -> tuple[Floats, dict[str, Floats]]:
         """BSDF times cosine `(N, 3)`, and its logarithm's derivatives by name.

@@ -24,6 +24,7 @@ from appearance.inverse_rendering.unknowns import Raw, decode, encode
 from appearance.metrics.decision import MATERIAL, Decision, Material, decide
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
+from reconstruction.geometry.lights import LightPattern
 
 SHARED_VIEWS, SHARED_LIGHTS = 3, 8
 """Views, and lights of each, for the global parameters."""
@@ -152,6 +153,8 @@ class _Fit:
             return f"no frame can be held out of {len(views)} x {len(self.lights)}"
         if stage in ("spatial", "correctives") and pixels < LEAST_PIXELS * cells:
             return f"{pixels} hair pixels are too few for {cells} cells"
+        if stage == "lights" and any(isinstance(x, LightPattern) for x in self.problem.lights):
+            return "patterns do not separate the lights' intensities"
         if stage == "lights" and len(views) < 2:
             return "one camera cannot separate a light's intensity from the hair's colour"
         if errors and errors[-1] < GOOD:

@@ -20,8 +20,9 @@ from appearance.observations import HeldOut, far_apart, observe_hair
 from appearance.render.bounces import bounce_limit
 from appearance.scene.hair_scene import build_scene
 from appearance.sun_fit.fitted_appearance import FittedAppearance
-from reconstruction import Capture, Mesh, Model, ModelError, Progress, Stage, Strands, silent
+from reconstruction import Capture, Light, Mesh, Model, ModelError, Progress, Stage, Strands, silent
 from reconstruction.arrays import Array
+from reconstruction.geometry.lights import components
 from reconstruction.report.progress import part_of
 from reconstruction.report.report import free_memory, resident_memory
 
@@ -56,8 +57,8 @@ def fit_maps(
     """
     held_out, request = held_out or HeldOut(), request or InverseRenderingRequest()
     training = held_out.training(capture)
-    names = training.olat_lights()
-    positions = np.array([training.rig.light(name).position for name in names])
+    names = training.lightings()
+    positions = np.array([training.lighting(name).position for name in names])
     held = min(request.validation_lights, len(names) // 4)
     training = training.view(lights=[names[k] for k in far_apart(positions, request.lights + held)])
     fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
@@ -66,7 +67,7 @@ def fit_maps(
         _check_memory(training, model, strands, request, stage, progress)
         progress("reading hair pixels", 0.0)
         rng = np.random.default_rng(seed)
-        views = observe_hair(training, model, training.olat_lights(), request.hair_pixels, rng)
+        views = observe_hair(training, model, training.lightings(), request.hair_pixels, rng)
         scene = build_scene(strands, head, hair=fitted.hair, skin=fitted.skin)
         mapped = MappedStrands.of(scene, strands, root_uv(model, strands, head))
         depth = request.max_depth
@@ -90,8 +91,11 @@ def fit_maps(
             model.remove(earlier)
         if found.kept:
             found.maps.save(model, mapped.root_uv)
-            save_lights(model, found.gain, problem.lights)
-            stage.warnings += _doubts(start, found.maps) + _flat(found.left_open)
+            if singles := [x for x in problem.lights if isinstance(x, Light)]:
+                save_lights(model, found.gain, singles)
+            stage.warnings += _doubts(start, found.maps, fitted.beta_m_error is not None) + _flat(
+                found.left_open
+            )
         result = {
             "stages": [x.to_dict() for x in found.decisions],
             "kept": found.kept,
@@ -107,8 +111,11 @@ def fit_maps(
     return result
 
 
-def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
-    """Why a fitted roughness is doubtful, one sentence each; empty if it is not."""
+def _doubts(start: HairMaps, found: HairMaps, measured: bool) -> list[str]:
+    """Why a fitted roughness is doubtful, one sentence each; empty if it is not.
+
+    `measured`: that of the start was.
+    """
     doubts = [
         f"{name} {value:.2f} lies outside {least} to {most}, the range in which it was recovered"
         for name, (least, most) in FOUND.items()
@@ -120,7 +127,7 @@ def _doubts(start: HairMaps, found: HairMaps) -> list[str]:
             f"beta_m {found.beta_m:.2f} may be too rough: the hair is black, and its fit began at "
             f"the sigma_a {before:.2g} of Sun's fit, against {after:.2g}"
         )
-    if not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
+    if measured and not doubts and abs(np.log(found.beta_m / start.beta_m)) > np.log(FROM_SUN):
         doubts.append(
             f"beta_m {found.beta_m:.2f} differs from {start.beta_m:.2f}, measured on "
             "highlights by Sun's fit: errors of the strands' positions look like roughness"
@@ -148,7 +155,10 @@ def _check_memory(
 ) -> None:
     """Report the memory that the process will need; refuse if it is not available."""
     hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
-    pixels, lights = [min(n, request.hair_pixels) for n in hair], len(training.olat_lights())
+    pixels, lights = (
+        [min(n, request.hair_pixels) for n in hair],
+        len(components([training.lighting(name) for name in training.lightings()])[0]),
+    )
     needed = memory_needed(Sizes(pixels, lights, len(strands.points)), request.fit)
     free = free_memory()
     stage.figures["memory_needed_gb"] = whole = (resident_memory() or 0.0) + needed

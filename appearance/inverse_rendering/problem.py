@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from appearance.observations import Observed
 from appearance.render.cached_paths import CachedPaths, CachedSampling, WeightedPixels, cache_paths
 from appearance.render.olat import render_indirect, render_olat
 from appearance.scene.hair_scene import HairScene, light_arrays
-from reconstruction import Camera, Light
+from reconstruction import Camera
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
+from reconstruction.geometry.lights import Lighting, components
 
 _DIRECT_PATHS, _FEWEST, _MOST = 400_000, 4, 16
 """Cached one-vertex paths of all views, and fewest and most per pixel."""
@@ -36,7 +37,7 @@ _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 class DirectLight:
     """Cached one-vertex paths of a `patch`: its direct light for any maps.
 
-    `intensities (L, 3)` of the patch's lights are in scene units, times the exposure.
+    `intensities (L, 3)` of the patch's single lights are in scene units, times the exposure.
     """
 
     mapped: MappedStrands
@@ -65,7 +66,7 @@ class FitProblem:
         self, mapped: MappedStrands, views: Sequence[Observed], scale: float, skin: Array
     ) -> None:
         self.mapped, self.views, self.scale, self.skin = mapped, tuple(views), scale, skin
-        self.lights: tuple[Light, ...] = views[0].lights if views else ()
+        self.lights: tuple[Lighting, ...] = views[0].lights if views else ()
         self._scenes: list[HairScene] = []
         self._level = [
             losses.level(o.radiance.astype(float) * scale).astype(np.float32) for o in self.views
@@ -155,7 +156,7 @@ class FitProblem:
         wanted = WeightedPixels(pixels, importance)
         sampling = CachedSampling(max(2, effort.spp), effort.max_depth)
         paths = cache_paths(scene, camera, lights, wanted, sampling, seed)
-        intensities = light_arrays(lights)[1] * self.scale
+        intensities = light_arrays(components(lights)[0])[1] * self.scale
         return LinearisedPictures(paths, self.mapped, decode(raw), intensities)
 
     def direct(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> DirectLight:
@@ -164,7 +165,8 @@ class FitProblem:
         wanted = WeightedPixels(pixels, np.ones((len(lights), len(pixels)), np.float32))
         sampling = CachedSampling(effort.spp, 1, _ALL)
         paths = cache_paths(scene, camera, lights, wanted, sampling, seed)
-        return DirectLight(self.mapped, patch, paths, light_arrays(lights)[1] * self.scale)
+        intensities = light_arrays(components(lights)[0])[1] * self.scale
+        return DirectLight(self.mapped, patch, paths, intensities)
 
     def indirect(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:
         """All pixels of a view under all lights `(L, P, 3)`, without the light that reaches the
@@ -202,13 +204,10 @@ class FitProblem:
 
     def _setup(
         self, raw: Raw, gain: Array, patch: Patch
-    ) -> tuple[HairScene, Camera, list[Light], Ints]:
+    ) -> tuple[HairScene, Camera, list[Lighting], Ints]:
         """Scene, camera, lights and pixels of a patch, as `raw` and `gain (L,)` have them."""
         o = self.views[patch.view]
-        lights = [
-            replace(self.lights[i], intensity=self.lights[i].intensity * gain[i])
-            for i in patch.lights
-        ]
+        lights = [self.lights[i].scaled(float(gain[i])) for i in patch.lights]
         return self._scene_of(raw), o.camera, lights, o.pixels[patch.few]
 
 

@@ -92,7 +92,9 @@ def assess(
     result: dict[str, Any] = {}
     report = model.report()
     with report.stage("images") as stage:
-        if held_out.cameras or held_out.lights:
+        if not training.olat_lights():
+            stage.warn("baselines and scores need single lights: nothing is compared")
+        elif held_out.cameras or held_out.lights:
             comparison = _Comparison(capture, training, model, fitted, held_out, options, seed)
             result = comparison.run(stage, progress)
         else:

@@ -18,6 +18,7 @@ from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.olat import render_olat
 from reconstruction import Capture, Model
+from reconstruction.geometry.lights import components
 from reconstruction.report.report import resident_memory
 
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
@@ -54,11 +55,12 @@ def estimate_fit(
     """
     training = held_out.training(capture)
     hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
-    lights, strands = len(training.olat_lights()), model.strands()
+    lightings = [training.lighting(name) for name in training.lightings()]
+    lights, strands = len(lightings), model.strands()
     path, base = _seconds_a_path(training, model), resident_memory() or 0.0
     effort = request.fit.effort
     pixels = [min(n, request.hair_pixels) for n in hair]
-    fitted = min(lights, request.lights + request.validation_lights)
+    fitted = len(components(lightings[: request.lights + request.validation_lights])[0])
     views = min(SHARED_VIEWS, len(pixels)) * min(SHARED_LIGHTS, fitted)
     judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
     shared = _PATHS["shared"] * views * effort.pixels * effort.spp / SHARED_LIGHTS + judged
@@ -85,7 +87,7 @@ def _seconds_a_path(training: Capture, model: Model) -> float:
     camera = cameras[len(cameras) // 2]
     hair = np.flatnonzero(model.mask(camera.name, "hair", training))
     pixels = hair[:: -(-max(len(hair), 1) // _PROBE_PIXELS)]
-    lights = [training.rig.light(name) for name in training.olat_lights()[:_PROBE_LIGHTS]]
+    lights = [training.lighting(name) for name in training.lightings()][:_PROBE_LIGHTS]
     seconds = []
     for seed in range(2):  # kernels are compiled in the first
         begun = time.perf_counter()

@@ -9,7 +9,7 @@ exact derivatives; its noise grows with the distance to the hair that the paths 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any
 
 import drjit as dr
@@ -24,7 +24,8 @@ from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque, opaque_index
 from reconstruction import Camera, Light
 from reconstruction.array_backend import for_kernels, rows_of
-from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.arrays import Array, Bools, Floats, Ints
+from reconstruction.geometry.lights import Lighting, components, mixed
 from reconstruction.options import Count, options
 
 _ROULETTE = 0.3
@@ -50,7 +51,7 @@ class CachedSampling:
 
 @dataclass(frozen=True, eq=False)
 class WeightedPixels:
-    """Flat pixel indices `index (P,)` and their weights under each light, `importance (L, P)`."""
+    """Flat pixel indices `index (P,)` and their weights in each picture, `importance (M, P)`."""
 
     index: Ints
     importance: Floats
@@ -82,7 +83,8 @@ class CachedPaths:
     across the fibre, both in the fibre's uncorrected frame. `onward` has one row for each vertex
     but the first of a path, in their order: how the vertex before it scattered. `lit` are lights
     that reach vertices, `light (len(lit),)` which. `starts` are the numbers of the first vertex of
-    each depth, and V.
+    each depth, and V. `mix (M, L)` turns pictures under the lights into those under patterns of
+    them, see `components`.
     """
 
     pixels: int
@@ -98,6 +100,7 @@ class CachedPaths:
     lit: Scattering
     light: Ints
     starts: Ints
+    mix: Array | None = None
 
     @property
     def nbytes(self) -> int:
@@ -109,7 +112,7 @@ class CachedPaths:
 def cache_paths(
     scene: HairScene,
     camera: Camera,
-    lights: Sequence[Light],
+    lights: Sequence[Lighting],
     pixels: WeightedPixels,
     sampling: CachedSampling,
     seed: int,
@@ -118,7 +121,10 @@ def cache_paths(
 
     Same arguments, same bytes.
     """
-    return _Drawing(Surface(scene), lights, pixels, sampling, seed).run(camera)
+    single, mix = components(lights)
+    if mix is not None:
+        pixels = replace(pixels, importance=mixed(mix.T, pixels.importance))
+    return replace(_Drawing(Surface(scene), single, pixels, sampling, seed).run(camera), mix=mix)
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from appearance.scene.hair_scene import HairScene
 from appearance.scene.opaque import opaque_index
 from reconstruction import Camera, Light
 from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.geometry.lights import Lighting, components, mixed
 from reconstruction.options import Count, options
 
 _PILOT = 512  # pixels of the pilot passes at most
@@ -76,30 +77,32 @@ class OlatOptions:
 def render_olat(
     scene: HairScene,
     camera: Camera,
-    lights: Sequence[Light],
+    lights: Sequence[Lighting],
     *,
     seed: int = 0,
     pixels: ArrayLike | None = None,
     **options: Any,
 ) -> Floats:
-    """Radiance under each of `lights` alone, W/(sr m²) at full level.
+    """Radiance under each of `lights` alone, W/(sr m²) at full level; a pattern's is a sum.
 
     Returns `(L, P, 3)` for `pixels (P,)` (flat indices), or `(L, H, W, 3)` without `pixels`.
     `options`: see `OlatOptions`. Same arguments, same bytes, with any number of threads. Raises
     `ValueError` for options out of range, `FloatingPointError` for infinite light.
     """
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
-    out = _rendered(_View(scene, camera, lights, index), OlatOptions(**options), seed)
+    single, mix = components(lights)
+    out = _rendered(_View(scene, camera, single, index), OlatOptions(**options), seed)
     field = field_of(scene, camera, index)
     if field is not None:
-        out = field.lit(out, lights)
+        out = field.lit(out, single)
+    out = mixed(mix, out)
     return out if pixels is not None else spread_out(out, index, camera)
 
 
 def render_indirect(
     scene: HairScene,
     camera: Camera,
-    lights: Sequence[Light],
+    lights: Sequence[Lighting],
     pixels: ArrayLike,
     *,
     seed: int = 0,
@@ -110,8 +113,9 @@ def render_indirect(
     Uniform fibres have the BSDF's mean over parts of their width, which halves the variance. Other
     hair has the BSDF of `render_olat`.
     """
-    view = _View(scene, camera, lights, pixel_indices(camera, pixels))
-    return _rendered(view, OlatOptions(**options), seed, indirect=True)
+    single, mix = components(lights)
+    view = _View(scene, camera, single, pixel_indices(camera, pixels))
+    return mixed(mix, _rendered(view, OlatOptions(**options), seed, indirect=True))
 
 
 def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,8 @@ from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.report.report import Series
 
 MAX_DEPTH = 16
+ASSUMED = 0.3
+"""β_M where there are no single lights, the middle of human hair's."""
 BETA_N = 0.2
 """Azimuthal roughness, fixed as in Sun §5.1."""
 ROUGHNESSES = (0.04, 0.12, 0.22, 0.35, 0.55, 0.95)
@@ -76,8 +79,9 @@ def fit(
 ) -> Report:
     """Fit roughness, hair colour and skin colour (Sun 2021, §5) and write `appearance.json`.
 
-    Uses the model's strands and masks and the OLAT frames of `capture` that are not `held_out`. The
-    returned report, also the model's, has the stages "samples", "roughness" and "colour". Raises
+    Uses the model's strands and masks and the OLAT frames of `capture` that are not `held_out`; of
+    patterns of lights the roughness is assumed, and the colour of sums is matched. The returned
+    report, also the model's, has the stages "samples", "roughness" and "colour". Raises
     `CaptureError` or `ValueError` naming what is missing.
     """
     held_out, options = held_out or HeldOut(), options or FitOptions()
@@ -95,12 +99,19 @@ def fit(
     scene = build_scene(strands, head, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N))
     fitting = SunFit(scene, pixels, options, seed, progress)
     with report.stage("roughness") as stage:
-        found = fitting.roughness(stage)
-        stage.warn(found.matched.limit())
-        roughness, first = found.matched, found.first
+        found = fitting.roughness(stage) if training.olat_lights() else None
+        if found is None:
+            stage.warn(
+                f"Patterns show no highlight of a single light: beta_m {ASSUMED} is assumed, and "
+                "only inverse rendering estimates it."
+            )
+            beta_m, first = ASSUMED, fitting.first_colour(ASSUMED)
+        else:
+            stage.warn(found.matched.limit())
+            beta_m, first = found.matched.beta_m, found.first
     with report.stage("colour") as stage:
         start = np.array(first.colour), np.array(first.skin)
-        colours = fitting.colour(roughness.beta_m, *start, stage)
+        colours = fitting.colour(beta_m, *start, stage)
         if head is None:
             stage.leave_out("skin colour", "there is no head mesh", "its renderings")
         elif not pixels.skin:
@@ -115,10 +126,15 @@ def fit(
                 "or a grey ball (docs/how-to/import.md)."
             )
     made = (colours.hair, colours.colour, colours.skin, exposure)
-    variances = float(variance_of_roughness(roughness.beta_m)), found.plain.v, found.printed
-    spread = roughness.error, (roughness.low, roughness.high), (red, green, blue)
+    v = float(variance_of_roughness(beta_m))
+    variances, spread = (v, v, v), dict[str, Any]()
+    if found is not None:
+        variances, roughness = (v, found.plain.v, found.printed), found.matched
+        spread["beta_m_error"] = roughness.error
+        spread["beta_m_interval"] = roughness.low, roughness.high
     model.forget_appearance()
-    FittedAppearance(*made, *variances, held_out, *spread).save(model)
+    errors = {**spread, "sigma_a_error": (red, green, blue)}
+    FittedAppearance(*made, *variances, held_out, **errors).save(model)
     for stale in ("inverse_rendering", "field", "images"):
         report.drop(stale)
     model.write_report(report)
@@ -159,8 +175,10 @@ class SunFit:
     def roughness(self, stage: Stage) -> Roughnesses:
         """The roughness by matched renderings.
 
-        Raises `ValueError` if no light lies near a mirror direction.
+        Raises `ValueError` for patterns, or if no light lies near a mirror direction.
         """
+        if any(len(o.single_lights) < len(o.lights) for o in self.pixels.hair):
+            raise ValueError("patterns show no highlight of a single light")
         self.progress("measuring the highlight", 0.3)
         hair = self.pixels.hair
         step = max(1, len(hair) // self.options.roughness_cameras)
@@ -182,9 +200,7 @@ class SunFit:
         channel = int(np.argmin(np.where(mean > 0, mean, np.inf)))
         plain, printed, count = self._read(views, channel)
         self.progress("a first colour", 0.4)
-        skin, unreported = np.array(self.scene.skin), Stage("first colour")
-        # of all light: near a highlight, indirect light comes from all directions
-        first = self.colour(plain.beta_m, None, skin, unreported, pixels=self.covered)
+        first = self.first_colour(plain.beta_m)
         captured, highlights = self._highlights(views, channel)
 
         def rendered(number: int, beta: float) -> Highlight:
@@ -214,6 +230,11 @@ class SunFit:
         for warning in found.warnings():
             stage.warn(warning)
         return Roughnesses(found, plain, printed, first)
+
+    def first_colour(self, beta_m: float) -> Colours:
+        """The colour of all light: near a highlight, indirect light comes from all directions."""
+        skin, unreported = np.array(self.scene.skin), Stage("first colour")
+        return self.colour(beta_m, None, skin, unreported, pixels=self.covered)
 
     @cached_property
     def covered(self) -> FitPixels:

@@ -39,7 +39,7 @@ def observed_pixels(
 ) -> FitPixels:
     """Read hair and skin of all cameras; raises `ValueError` if there is no hair or it is dark."""
     rng = np.random.default_rng(seed)
-    cameras, lights = [c.name for c in training.rig.cameras], training.olat_lights()
+    cameras, lights = [c.name for c in training.rig.cameras], training.lightings()
     hair, skin, hair_pixels = [], [], 0
     has_head = model.head(training) is not None
     for i, name in enumerate(cameras):

@@ -178,7 +178,7 @@ def near_mirror(
     near = (np.abs(deviation) < window) & observed.valid
     near &= (across_i * across_o).sum(-1) > np.cos(WINDOW)
     near &= usable(fibres)
-    shines = np.array([light.intensity_towards(middle) for light in observed.lights])
+    shines = np.array([light.intensity_towards(middle) for light in observed.single_lights])
     shines = shines.reshape(*near.shape, 3)
     least = LEAST_LIT * shines.max(axis=1, keepdims=True, initial=0)
     near &= ((shines > 0) & (shines >= least)).all(axis=-1)

@@ -293,7 +293,6 @@ def _as_albedo(views: Sequence[Observed]) -> Array:
     for o in views:
         for light in o.lights:
             # half of the lights of a dome lie behind any surface, and those in front at 60 degrees
-            intensity = light.intensity_towards(np.zeros(3))
-            irradiance += intensity / (4 * np.pi * (light.position @ light.position))
+            irradiance += light.irradiance(np.zeros(3)) / (4 * np.pi)
     lights = sum(len(o.lights) for o in views)
     return _mean_colour(views) / np.maximum(irradiance / lights, 1e-12)

@@ -27,8 +27,8 @@ class Patterns:
 
     `{camera}`, `{light}`, `{pattern}` and `{projector}` are names, or the number at the end of a
     name with any zeros before it (7, 07, light_07); `{exposure}` is seconds (`0.02`, `1-50`) or a
-    key of `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for tracking
-    frames and rows (lights captured once may be counted per camera); `*` is any text.
+    key of `exposures`; `{row}` a projector's row; `{number}` the order of capture, one count for
+    tracking frames and rows (lights captured once may be counted per camera); `*` is any text.
     `clean_plate` shows the stage without the subject, `flat` an evenly lit field. Without lights,
     and with a table of patterns of lights, the default `olat` is not used. Without lights `all_on`,
     `hair` and `subject` default to the first of `PHOTOGRAPHS` that match a file, with a table

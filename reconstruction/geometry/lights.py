@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reconstruction.arrays import Array
+from reconstruction.arrays import AnyFloats, Array
 from reconstruction.geometry.light_profiles import LightProfile
 
 
@@ -154,6 +154,14 @@ def components(lightings: Sequence[Lighting]) -> tuple[list[Light], Array | None
         else:
             row[at[x.name]] = 1.0
     return list(lights.values()), mix
+
+
+def mixed(mix: Array | None, pictures: AnyFloats, axis: int = 0) -> Any:
+    """The sums `mix (M, L)` of `pictures (…, L, …)` along `axis`; None: as they are."""
+    if mix is None:
+        return pictures
+    sums = np.tensordot(mix.astype(pictures.dtype), pictures, (1, axis))
+    return np.moveaxis(sums, 0, axis)
 
 
 def dome_positions(count: int, radius: float, lowest_deg: float = -90.0) -> Array:

@@ -103,6 +103,8 @@ def fields(context: StepContext) -> Figures:
 
     if "field" not in context.options.stages:
         return {"left_out": "the stage was not requested"}
+    if not context.frames().olat_lights():
+        return {"left_out": "a field needs images of single lights, and the capture has none"}
     return run(**context.for_appearance(), request=context.options.fields)
 
 

@@ -102,6 +102,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     for name in ("fit", "inverse_rendering", "fields"):
         found = step(name)
+        if name == "fields" and "field" in options.stages and "left_out" in found:
+            output.note(f"field: {found['left_out']}")
         data |= {} if "left_out" in found else {name: found}
         for stage in found.get("stages", ()):
             output.note(stage["line"])

@@ -171,7 +171,7 @@ def recovery(
     as calibrated) and, with lights off, "lights" (lights fitted too).
     """
     rng = np.random.default_rng([seed, 9])
-    lights = captured.views[0].lights
+    lights = captured.views[0].single_lights
     off = [
         replace(
             x,

@@ -123,7 +123,7 @@ class Table:
         pictures: list[tuple[Array, Array]] = []
         for k in dict.fromkeys(k for k, _ in pairs):
             o = self.captured.views[k]
-            lights = [o.lights[i] for view, i in pairs if view == k]
+            lights = [o.single_lights[i] for view, i in pairs if view == k]
             sampling = (rig.judged_spp, (self.seed << 8) + 31 + 2 * k)
             one, other = rig.halves(scene, o.camera, lights, o.pixels, sampling)
             pictures += list(zip(one.astype(float), other.astype(float), strict=True))

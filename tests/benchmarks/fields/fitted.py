@@ -90,9 +90,9 @@ def fitted_frames(
     for k, o in enumerate(captured.views):
         progress(f"view {k}: rendering {len(o.lights)} lights", k / len(captured.views))
         sampling = (captured.rig.judged_spp, (seed << 8) + 31 + 2 * k)
-        halves = captured.rig.halves(scene, o.camera, o.lights, o.pixels, sampling)
+        halves = captured.rig.halves(scene, o.camera, o.single_lights, o.pixels, sampling)
         hits = find_hits(captured.mapped, o.camera, o.pixels, HitOptions(16, seed))
-        pictures.append(Pictures(hits, o.lights, np.stack(halves), o.radiance, o.valid))
+        pictures.append(Pictures(hits, o.single_lights, np.stack(halves), o.radiance, o.valid))
         rendered.append(halves)
     frames = Frames(
         tuple(pictures),
