@@ -22,6 +22,8 @@ MEMORY = 1 << 30
 _FRAMES = 8
 _SAMPLES = 20_000
 """Pixels of a camera by which the noise of frames is estimated."""
+_TURNS, _LEAST = 5, 0.01
+"""Rounds of that estimate, and its least variance over the median."""
 _NONE = 1e-9
 """Coefficient below which a frame does not contribute."""
 
@@ -128,15 +130,17 @@ def _weighted(
         values.append(image.reshape(-1, 3)[::step].astype(float))
         usable = ~saturated.ravel()[::step]
         known = usable if known is None else known & usable
-    frames = np.stack(values)[:, known]
-    hat = solution.weights @ solution.matrix
-    residual = frames - np.tensordot(hat, frames, 1)
-    mean = np.square(residual).mean(axis=(1, 2))
+    frames, misfit = np.stack(values)[:, known], 0.0
     size = float(np.square(frames).mean()) or 1.0
-    # of equal variances, a frame's mean square residual is its share without leverage
-    share = np.maximum(1 - np.diag(hat), 1e-6)
-    variances = np.maximum(mean / share, 1e-12 * size)
-    return Demultiplexing(solution.weights, variances), float(np.sqrt(mean.mean() / size))
+    for turn in range(_TURNS):
+        hat = solution.weights @ solution.matrix
+        mean = np.square(frames - np.tensordot(hat, frames, 1)).mean(axis=(1, 2))
+        misfit = misfit if turn else float(np.sqrt(mean.mean() / size))
+        # a frame's mean square residual is its variance less its leverage
+        variances = mean / np.maximum(1 - np.diag(hat), 1e-6)
+        least = max(_LEAST * float(np.median(variances)), 1e-12 * size)
+        solution = Demultiplexing(solution.weights, np.maximum(variances, least))
+    return solution, misfit
 
 
 def _write(

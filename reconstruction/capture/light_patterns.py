@@ -162,15 +162,11 @@ def read_patterns(path: Path, lights: Sequence[str]) -> LightPatterns:
     if path.suffix.lower() not in readers:
         raise PatternError(f"{path}: expected a table of patterns ({', '.join(readers)})")
     try:
-        rows = readers[path.suffix.lower()](path)
-        names = list(dict.fromkeys(name for row in rows.values() for name in row))
-        own = dict(zip(names, _matching(names, lights), strict=True))
-        if len(set(own.values())) < len(names):
-            raise PatternError("two columns are of the same light")
-        used = [n for n in names if any(row.get(n, 0) != 0 for row in rows.values())]
-        weights = [[row.get(n, 0.0) for n in used] for row in rows.values()]
+        rows = {n: _matching(w, lights) for n, w in readers[path.suffix.lower()](path).items()}
+        used = list(dict.fromkeys(x for row in rows.values() for x, w in row.items() if w != 0))
+        weights = [[row.get(x, 0.0) for x in used] for row in rows.values()]
         table = np.array(weights, float).reshape(len(rows), len(used))
-        return LightPatterns(tuple(rows), tuple(own[n] for n in used), table)
+        return LightPatterns(tuple(rows), tuple(used), table)
     except (OSError, ValueError, TypeError) as error:
         text = str(error).removeprefix(f"{path}: ")
         raise PatternError(f"{path}: {text}") from error
@@ -199,7 +195,7 @@ def _json(path: Path) -> dict[str, dict[str, float]]:
     data = data.get("patterns", data) if isinstance(data, dict) else data
     if not isinstance(data, dict):
         raise PatternError("expected an object of patterns by name")
-    out = {}
+    out = dict[str, dict[str, float]]()
     for name, row in data.items():
         weights = dict.fromkeys(map(str, row), 1.0) if isinstance(row, list) else row
         if not isinstance(weights, Mapping):
@@ -208,12 +204,14 @@ def _json(path: Path) -> dict[str, dict[str, float]]:
     return out
 
 
-def _matching(names: Sequence[str], lights: Sequence[str]) -> list[str]:
-    """The rig's name of each light of a table."""
+def _matching(row: Mapping[str, float], lights: Sequence[str]) -> dict[str, float]:
+    """A row of a table by the rig's names."""
     numbers = {light_name(x.rsplit("_", 1)[-1]): x for x in lights if x[-1:].isdigit()}
-    found = [n if n in lights else numbers.get(light_name(n.rsplit("_", 1)[-1]), n) for n in names]
+    found = [n if n in lights else numbers.get(light_name(n.rsplit("_", 1)[-1]), n) for n in row]
     _known(found, lights)
-    return found
+    if len(set(found)) < len(found):
+        raise PatternError("two columns are of the same light")
+    return dict(zip(found, row.values(), strict=True))
 
 
 def _known(names: Sequence[str], lights: Sequence[str]) -> None:

@@ -239,7 +239,10 @@ def lighting_patterns(root: Path) -> list[str]:
     ("write", "said"),
     [
         (nersemble, "cam_222200037.mp4: videos are not read: extract its frames"),
-        (lighting_patterns, "a pattern of many lamps, single lights are needed: download"),
+        (
+            lighting_patterns,
+            "by a pattern of many lamps: give a table of their weights (--patterns",
+        ),
     ],
 )
 def test_a_set_without_single_lights_is_refused_with_the_way_on(
@@ -252,6 +255,19 @@ def test_a_set_without_single_lights_is_refused_with_the_way_on(
     assert main(["import", *words, "--out", str(tmp_path / "capture")]) == 3
     assert said in capsys.readouterr().err
     assert not (tmp_path / "capture").exists()
+
+
+def test_patterns_of_openillumination_are_read_with_a_table(tmp_path: Path) -> None:
+    words = lighting_patterns(tmp_path)
+    rows = {f"{i:03d}": [str(i), str(i + 1)] for i in range(1, 14)}
+    (tmp_path / "table.json").write_text(json.dumps(rows))
+    words += ["--patterns", str(tmp_path / "table.json"), "--out", str(tmp_path / "capture")]
+    assert main(["import", *words]) == 0
+    capture = Capture(tmp_path / "capture")
+    assert capture.lightings() == list(rows)
+    assert len(capture.rig.lights) == 14
+    step = next(s for s in capture.steps if s.pattern == "007")
+    assert number_of(capture.frame(step, "B3")) == (7, 1)
 
 
 def test_what_openillumination_lacks_is_named(
