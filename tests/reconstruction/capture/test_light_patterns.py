@@ -12,7 +12,6 @@ from scipy.linalg import hadamard
 from reconstruction import Capture, CaptureError, CaptureWriter, Step, verify, write_exr
 from reconstruction.capture.demultiplexing import demultiplex
 from reconstruction.capture.import_folder import import_folder
-from reconstruction.capture.import_settings import ImportProblem, ImportSettings
 from reconstruction.capture.light_patterns import (
     Demultiplexing,
     LightPatterns,
@@ -24,30 +23,20 @@ from stage_service.cli import main
 LIGHTS = [f"light_{i:02d}" for i in range(7)]
 S = (1 - hadamard(8)[1:, 1:]) // 2
 """The S-matrix of order 7."""
-SIZE = 24, 16
 SINGLES = np.random.default_rng(0).random((2, 7, 16, 24, 3)).astype(np.float32)
 CAMERAS = ("left", "right")
 
 
 def test_gains_of_an_s_matrix_are_the_published_ones() -> None:
-    """Harwit and Sloane: a noise of 2√n / (n + 1); photon noise: √2 of that of n → ∞."""
+    """Harwit and Sloane (1979): 2√n / (n + 1), and √((n + 1) / 2) times that of photons."""
     solution = Demultiplexing(S.astype(float))
     np.testing.assert_allclose(solution.read_gain, 2 * np.sqrt(7) / 8)
     np.testing.assert_allclose(solution.photon_gain, 2 * np.sqrt(7) / 8 * 2)
-    np.testing.assert_allclose(solution.matrix @ S, np.eye(7), atol=1e-12)
     assert solution.condition == pytest.approx(np.sqrt(8))
-    assert len(solution.warnings()) == 1
-    assert "photon noise of 7 of 7 lights is amplified, up to 1.3 times" in solution.warnings()[0]
-
-
-def test_single_lights_cost_nothing_and_a_lack_of_patterns_is_infinite() -> None:
-    singles = Demultiplexing(np.eye(5))
-    np.testing.assert_allclose([*singles.read_gain, *singles.photon_gain], 1)
-    assert singles.condition == 1
-    assert not singles.warnings()
-    few = Demultiplexing(S[:5].astype(float))
-    assert not few.spans
-    assert np.isinf(few.condition)
+    (warning,) = solution.warnings()
+    assert "photon noise of 7 of 7 lights is amplified, up to 1.3 times" in warning
+    assert not Demultiplexing(np.eye(5)).warnings()
+    assert not Demultiplexing(S[:5].astype(float)).spans
     near = np.ones((2, 2)) - np.diag([0.0, 1e-4])
     assert "condition number 4e+04" in Demultiplexing(near).warnings()[0]
 
@@ -56,22 +45,18 @@ def test_single_lights_cost_nothing_and_a_lack_of_patterns_is_infinite() -> None
     ("table", "said"),
     [
         ("name,0,1\np,1,nan", "pattern p: the weight of light_01 must be 0 to 1, got nan"),
-        ("name,0,1\np,1,1.5", "weight of light_01 must be 0 to 1, got 1.5"),
         ("name,0,1\np,-1,0", "weight of light_00 must be 0 to 1"),
         ("name,0,1\np,0,0\nq,1,0", "pattern p lights nothing"),
         ("name,0,1\np,0,0", "at least one"),
         ("name,0,9\np,1,1", "there is no light '9'; its 7 are light_00"),
         ("name,0,1\np,1", "pattern p: expected one row of 2 weights, got 1"),
-        ("name,0,1\np,1,1\np,1,0", "pattern p: expected one row"),
         ("name,0,00\np,1,1", "two columns are of the same light"),
         ("name,0,1\np,1,on", "pattern p: could not convert"),
-        ("name,0,1\nlight_00,1,1", "a file's name that no light has"),
         ("name,0,1\n../p,1,1", "a file's name that no light has"),
         ("", "expected a header with the lights"),
         ({"p": {"light_00": 2}}, "must be 0 to 1, got 2"),
         ({"p": 3}, "pattern p: expected weights by light, or a list of lights"),
         ([], "expected an object of patterns"),
-        ({}, "at least one"),
     ],
 )
 def test_a_wrong_table_is_refused(table: str | dict | list, said: str, tmp_path: Path) -> None:
@@ -91,22 +76,17 @@ def test_tables_of_both_kinds_are_read_alike(tmp_path: Path) -> None:
         assert found.names == ("sky", "all")
         assert found.lights == ("light_03", "light_01")  # light_02 is in no pattern
         np.testing.assert_array_equal(found.weights, [[1, 0.5], [1, 1]])
-    with pytest.raises(PatternError, match="expected weights of 1 patterns × 2 lights"):
-        LightPatterns(("p",), ("a", "b"), np.ones((2, 1)))
 
 
 def folder_of(root: Path, weights: np.ndarray, layout: str = "images/{camera}/{pattern}.exr"):
     root.mkdir()
-    K = [[40, 0, 11.5], [0, 40, 7.5], [0, 0, 1]]
-    R = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    pose = {"K": [[40, 0, 11.5], [0, 40, 7.5], [0, 0, 1]], "R": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
     cameras = [
-        {"id": c, "width": 24, "height": 16, "K": K, "R": R, "t": [0.1 * i, 0, 1.0]}
+        {"id": c, "width": 24, "height": 16, **pose, "t": [0.1 * i, 0, 1.0]}
         for i, c in enumerate(CAMERAS)
     ]
-    lights = [
-        {"id": i, "position": [np.cos(i), np.sin(i) - 0.2, 0.4], "intensity": [1, 1, 1]}
-        for i in range(7)
-    ]
+    places = [[np.cos(i), np.sin(i) - 0.2, 0.4] for i in range(7)]
+    lights = [{"id": i, "position": p, "intensity": [1, 1, 1]} for i, p in enumerate(places)]
     (root / "cameras.json").write_text(json.dumps({"cameras": cameras}))
     (root / "lights.json").write_text(json.dumps({"lights": lights}))
     rows = [f"p_{k}," + ",".join(map(str, row)) for k, row in enumerate(weights.tolist())]
@@ -119,71 +99,54 @@ def folder_of(root: Path, weights: np.ndarray, layout: str = "images/{camera}/{p
     return root
 
 
-@pytest.mark.parametrize(
-    "layout", ["images/{camera}/{pattern}.exr", "images/{pattern}/{camera}.exr"]
-)
+@pytest.mark.parametrize("layout", ["{camera}/{pattern}", "{pattern}/{camera}"])
 def test_patterns_become_single_lights(
     layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From the command line; the frames are sums of known single lights."""
-    folder, out, single = folder_of(tmp_path / "f", S, layout), tmp_path / "c", tmp_path / "s"
+    folder, out, single = (
+        folder_of(tmp_path / "f", S, f"images/{layout}.exr"),
+        *(tmp_path / n for n in "cs"),
+    )
     assert main(["import", str(folder), "--out", str(out)]) == 0
-    capture = Capture(out)
-    assert capture.lightings() == [f"p_{k}" for k in range(7)]
-    assert capture.olat_lights() == []
+    assert Capture(out).lightings() == [f"p_{k}" for k in range(7)]
     assert main(["demultiplex", str(out), "--out", str(single)]) == 0
     said = capsys.readouterr()
     assert "read noise: 0.66 times a single frame's, at most 0.66" in said.out
     assert "warning: photon noise of 7 of 7 lights is amplified" in said.err
     found = Capture(single)
     assert verify(single) == []
-    assert found.olat_lights() == LIGHTS
     for camera, singles in zip(CAMERAS, SINGLES, strict=True):
-        np.testing.assert_allclose(found.olat(camera)[0], singles, atol=2e-6)
+        np.testing.assert_allclose(found.olat(camera, LIGHTS)[0], singles, atol=2e-6)
     assert main(["demultiplex", str(single), "--out", str(tmp_path / "t")]) == 3
     assert "no frames under patterns" in capsys.readouterr().err
 
 
-def test_too_few_patterns_and_a_missing_table_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_few_patterns_are_refused_and_a_table_elsewhere_is_named(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "f", S[:5])
-    capture = import_folder(folder, tmp_path / "c")
-    with pytest.raises(CaptureError, match="5 patterns do not determine 7 lights: 'hairstage rec"):
-        demultiplex(capture, tmp_path / "s")
-    assert not (tmp_path / "s").exists()
-    (folder / "patterns.csv").rename(folder / "table.csv")
+    table = (folder / "patterns.csv").rename(tmp_path / "table.csv")
     words = ["import", str(folder), "--pictures", "images/{camera}/{pattern}.*"]
-    assert (
-        main([*words, "--out", str(tmp_path / "d"), "--patterns", str(folder / "table.csv")]) == 0
-    )
-    (folder / "table.csv").write_text("name,0\nother,1")
-    with pytest.raises(ImportProblem, match="no file matches .* and a pattern of other"):
-        import_folder(
-            folder, tmp_path / "e", settings=ImportSettings(patterns=folder / "table.csv")
-        )
+    assert main([*words, "--out", str(tmp_path / "c"), "--patterns", str(table)]) == 0
+    with pytest.raises(CaptureError, match="5 patterns do not determine 7 lights: 'hairstage rec"):
+        demultiplex(Capture(tmp_path / "c"), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
 
 
 def test_noisy_and_missing_frames(tmp_path: Path) -> None:
     """Twice the patterns: a noisy frame weighs less, a missing one is done without."""
     weights = np.concatenate([S, np.eye(7)])
     folder = folder_of(tmp_path / "f", weights)
-    rng = np.random.default_rng(1)
-    bad = folder / "images" / "left" / "p_2.exr"
-    write_exr(bad, np.tensordot(S[2], SINGLES[0], 1) + rng.normal(0, 0.5, (16, 24, 3)))
+    noise = np.random.default_rng(1).normal(0, 0.5, (16, 24, 3))
+    bad = np.tensordot(S[2], SINGLES[0], 1) + noise
+    write_exr(folder / "images" / "left" / "p_2.exr", bad)
     (folder / "images" / "right" / "p_3.exr").unlink()
-    capture = import_folder(folder, tmp_path / "c")
-    made = demultiplex(capture, tmp_path / "s")
+    made = demultiplex(import_folder(folder, tmp_path / "c"), tmp_path / "s")
     assert made.misfit is not None
     assert made.misfit > 0.01
     left, right = (made.capture.olat(c)[0] for c in CAMERAS)
     np.testing.assert_allclose(right, SINGLES[1], atol=5e-6)
-    plain = np.tensordot(
-        np.linalg.pinv(weights),
-        np.stack([capture.light(n, "left")[0] for n in capture.lightings()]),
-        1,
-    )
-    assert np.std(left - SINGLES[0]) < 0.1 * np.std(plain - SINGLES[0])
+    unweighted = np.linalg.norm(np.linalg.pinv(weights)[:, 2]) * 0.5 / np.sqrt(7)
+    assert np.std(left - SINGLES[0]) < 0.1 * unweighted
 
 
 def test_a_saturated_pixel_is_in_the_lights_that_it_takes_part_in(tmp_path: Path) -> None:
