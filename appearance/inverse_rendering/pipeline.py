@@ -93,7 +93,7 @@ def fit_maps(
             found.maps.save(model, mapped.root_uv)
             if singles := [x for x in problem.lights if isinstance(x, Light)]:
                 save_lights(model, found.gain, singles)
-            stage.warnings += _doubts(start, found.maps, fitted.beta_m_error is not None) + _flat(
+            stage.warnings += _doubts(start, found.maps, bool(training.olat_lights())) + _flat(
                 found.left_open
             )
         result = {
