@@ -16,6 +16,7 @@ from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.hair_envelope import build_envelope
 from reconstruction.growth.surface_strands import SurfaceOptions, surface_strands
 from reconstruction.head.capture_head import FittedHead
+from reconstruction.images.faint_parts import faint_warnings
 from reconstruction.light_codes.line_strands import line_strands
 from reconstruction.light_codes.segments import Segments
 from reconstruction.light_planes import Motion, PointCloud, solve_motion, sweep_peaks, triangulate
@@ -138,6 +139,8 @@ class MeasuringStages(Stages):
                 self.model.write_mask(name, "hair", whole.mask_as_shot(name, mask.hair))
                 self.model.write_mask(name, "skin", whole.mask_as_shot(name, mask.skin))
             report_agreement(whole, every, cloud, mesh, stage)
+            for warning in faint_warnings(capture, {k: m.subject for k, m in every.items()}):
+                stage.warn(warning)
             masks = usable_masks(capture, every, stage)
             stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
             stage.figures["source"] = {k: m.source for k, m in masks.items()}

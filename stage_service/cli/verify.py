@@ -100,6 +100,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     """
     from reconstruction.capture.contact_sheet import contact_sheet
     from reconstruction.capture.writer import require_vacant
+    from reconstruction.images.faint_parts import faint_warnings
     from reconstruction.images.scene_checks import check_scene
 
     understood, notes = _understood(args)
@@ -118,7 +119,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     with progress_bar("import") as progress:
         capture = understood.write(args.out, progress)
         progress("comparing light positions with images", 1.0)
-        doubts = check_scene(capture)
+        doubts = [*check_scene(capture), *faint_warnings(capture)]
     for note in doubts:
         output.note(note)
     counts = {
