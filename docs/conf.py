@@ -7,6 +7,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
+import figures  # noqa: E402
 import generate  # noqa: E402
 
 project = "hairstage"
@@ -28,3 +29,4 @@ nitpicky = True
 linkcheck_ignore = [r"http://localhost:\d+"]
 
 generate.write_pages(HERE / "reference" / "generated")
+figures.write_figures(HERE / "reference" / "generated")

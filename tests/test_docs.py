@@ -6,16 +6,19 @@ import argparse
 import importlib.util
 import json
 import re
+import runpy
 import shlex
 from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmarks.__main__ import MODULES
 from benchmarks.publish import page_of
 
+from appearance.render.harmonics import projected
 from stage_service.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -167,3 +170,14 @@ def test_every_test_that_the_page_of_hazards_names_is_there():
     named = set(re.findall(r"`(tests/[^`]+)`", page))
     assert len(named) > 10
     assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
+def test_an_environment_maps_column_is_the_renderers() -> None:
+    """Light from the face's direction, where the figure marks it, has y = −1 in the renderer."""
+    figures = runpy.run_path(str(ROOT / "docs" / "figures.py"))
+    for direction in figures["AXES"].values():
+        sky = np.zeros((64, 128, 3))
+        sky[31:33, int(figures["column_of"](direction) * 128) % 128] = 1.0
+        _, y, z, x = projected(sky, 0.0, 1)[:, 0]
+        found = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+        assert found @ direction > 0.99

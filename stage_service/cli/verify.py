@@ -41,6 +41,12 @@ def add(commands: Commands) -> None:
         help="only list what would be imported, and draw a contact sheet next to --out",
     )
     imported.add_argument(
+        "--targets",
+        action="store_true",
+        help="with --dry-run: find a chart of 24 colours and a grey ball, draw them next to --out, "
+        "and print their lines for import.toml",
+    )
+    imported.add_argument(
         "--cameras",
         type=Path,
         help="instead of cameras.json: of COLMAP, nerfstudio, Metashape, OpenCV",
@@ -101,8 +107,11 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.capture.contact_sheet import contact_sheet
     from reconstruction.capture.writer import require_vacant
     from reconstruction.images.faint_parts import faint_warnings
+    from reconstruction.images.import_targets import find_targets
     from reconstruction.images.scene_checks import check_scene
 
+    if args.targets and not args.dry_run:
+        raise BadArgument("--targets needs --dry-run: it only proposes lines for import.toml")
     understood, notes = _understood(args)
     notes += understood.response.notes
     for note in notes:
@@ -113,8 +122,16 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         sheet = out.with_name(f"{out.name}-contact-sheet.png")
         sheet.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(understood, sheet)
-        text = "\n".join([*understood.summary(), f"{sheet}: contact sheet"])
-        output.result({"sheet": str(sheet), **understood.counts(), "notes": notes}, text)
+        lines, data = [*understood.summary(), f"{sheet}: contact sheet"], {}
+        if args.targets:
+            proof = out.with_name(f"{out.name}-targets.png")
+            targets = find_targets(understood, proof)
+            notes += targets.notes
+            lines += [*targets.notes, f"{proof}: if its outlines are right, add to import.toml:"]
+            lines.append(targets.toml or "nothing")
+            data = {"targets": str(proof), "toml": targets.toml}
+        counts = understood.counts()
+        output.result({"sheet": str(sheet), **data, **counts, "notes": notes}, "\n".join(lines))
         return
     with progress_bar("import") as progress:
         capture = understood.write(args.out, progress)
