@@ -38,6 +38,8 @@ def faint_share(image: AnyFloats, mask: Bools) -> float:
     if not mask.any() or not noise > 0:
         return 0.0
     away = ~ndimage.binary_dilation(mask, iterations=3)  # bright outlines are not smoothed in
+    if not away.any():
+        return 0.0
     weight = ndimage.gaussian_filter(away.astype(np.float32), SMOOTHED)
     values: Floats = np.where(away, image - level, 0).astype(np.float32)
     mean = ndimage.gaussian_filter(values, SMOOTHED) / np.maximum(weight, 1e-6)

@@ -46,12 +46,12 @@ HELD_OUT = slice(7, None, 16)
 COMPARED = AssessOptions(spp=16, relit_size=64, relit_spp=1)
 
 
-def _command(*words: object) -> None:
-    """Run one of the product's commands; raises `CommandError` with what it said."""
-    command = own_command(*map(str, words))
-    done = subprocess.run(command, capture_output=True, text=True)
+def run_product(*words: object) -> dict[str, Any]:
+    """The JSON of one of the product's commands; raises `CommandError` with its message."""
+    done = subprocess.run(own_command(*map(str, words), "--json"), capture_output=True, text=True)
     if done.returncode:
         raise CommandError(f"{' '.join(map(str, words))}: {done.stderr[-600:]}", done.returncode)
+    return dict(json.loads(done.stdout))
 
 
 def _scored(capture: Capture, model: Model, truth: StrandTruth, seed: int) -> dict[str, Any]:
@@ -74,9 +74,9 @@ def _imported(
 ) -> tuple[Capture, Model]:
     """The capture written out, imported and reconstructed by the commands."""
     folder = write_folder(observed, work / "folder", written, args.seed)
-    _command("import", folder, "--out", work / "capture", "--json")
+    run_product("import", folder, "--out", work / "capture")
     model, options = work / "model", json.dumps(_options(args))
-    _command("reconstruct", work / "capture", "--out", model, "--options", options, "--json")
+    run_product("reconstruct", work / "capture", "--out", model, "--options", options)
     return Capture(work / "capture"), Model(model)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.captures import Optics, SimulatedCapture, levels, rig_file
 from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, Option, option, within
+from benchmarks.importing.damages import run_product
 from benchmarks.importing.folders import write_colmap
 from benchmarks.results import save
 from benchmarks.strand_truth import write_hair_masks
@@ -36,13 +37,12 @@ from reconstruction import (
     write_exr,
     write_strands,
 )
-from reconstruction.arrays import Bools, Floats
 from reconstruction.evaluation.baselines import baseline_hull, hull_smooth_field, hull_vertical
 from reconstruction.evaluation.visibility import Visibility
+from reconstruction.files.durable import write_json
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.images.silhouettes import lit_rgb
 from reconstruction.images.srgb import srgb
-from stage_service.cli.support.children import own_command
 from stage_service.cli.support.commands import CommandError
 
 HERE = Path(__file__).resolve().parent
@@ -85,7 +85,6 @@ def write_subject(capture: Capture, truth: Path, folder: Path) -> None:
         _write_cameras(capture, variant, "{}/all.exr" if variant.name == "stage" else "{}.png")
         shutil.copyfile(truth / "head.obj", variant / "head.obj")
         shutil.copytree(capture.path / "masks", variant / "masks")
-    _write_hairgs(true, folder / "truth" / "hair_eval_data.npz")
     (folder / "truth" / "visibility").mkdir()
     found: Any
     for name, found in Visibility(capture.rig.cameras, true, head).depth_maps().items():
@@ -124,21 +123,21 @@ def _write_stage(capture: Capture, folder: Path) -> None:
     (folder / "import.toml").write_text(
         f'units = "radiance"\n[sensor]\nresponse = "linear"\n[pictures]\n{patterns}'
     )
-    rig = capture.rig.to_dict()
     lights = [
         {"id": x.name, "position": x.position.tolist(), "intensity": x.intensity.tolist()}
         for x in capture.rig.lights
     ]
-    (folder / "lights.json").write_text(json.dumps({"lights": lights}, indent=1) + "\n")
+    write_json(folder / "lights.json", {"lights": lights})
     if "scanline" in used:
-        projectors = {"projectors": rig["projectors"]}
-        (folder / "projectors.json").write_text(json.dumps(projectors, indent=1) + "\n")
+        projectors = capture.rig.to_dict()["projectors"]
+        write_json(folder / "projectors.json", {"projectors": projectors})
 
 
 def _write_lit(capture: Capture, folder: Path) -> None:
-    """One photograph a camera, all at one exposure: 99 % of the subject is below white."""
+    """One photograph a camera, all at one exposure: 99 % of the hair is below white."""
     images = {c.name: lit_rgb(capture, c.name) for c in capture.rig.cameras}
-    white = np.quantile(np.concatenate([i[_lit(i)].max(axis=-1) for i in images.values()]), 0.99)
+    hair = [i[capture.mask(n)].max(axis=-1) for n, i in images.items()]
+    white = np.quantile(np.concatenate(hair), 0.99)
     (folder / "images").mkdir(parents=True)
     (folder / "linear").mkdir()
     for name, image in images.items():
@@ -147,34 +146,15 @@ def _write_lit(capture: Capture, folder: Path) -> None:
         cv2.imwrite(str(folder / "images" / f"{name}.png"), shot.astype(np.uint8)[..., ::-1])
 
 
-def _lit(image: Floats) -> Bools:
-    grey = image.mean(axis=-1)
-    return np.asarray(grey > 0.05 * np.quantile(grey, 0.99))
-
-
 def _write_cameras(capture: Capture, folder: Path, picture: str) -> None:
     cameras = [
         {"id": c.name, "width": c.width, "height": c.height}
         | {"K": c.K.tolist(), "R": c.R.tolist(), "t": c.t.tolist()}
         for c in capture.rig.cameras
     ]
-    (folder / "cameras.json").write_text(json.dumps({"cameras": cameras}, indent=1) + "\n")
+    write_json(folder / "cameras.json", {"cameras": cameras})
     write_colmap(capture, folder / "sparse" / "0", 1.0, picture)
     (folder / "sparse" / "0" / "points3D.txt").write_text("")
-
-
-def _write_hairgs(true: Strands, path: Path) -> None:
-    """The truth as HairGS's eval.py reads it: first points of segments, and their directions."""
-    start = true.segment_starts
-    strand = true.strand_of_point[start]
-    follows = np.flatnonzero(strand[1:] == strand[:-1])
-    np.savez_compressed(
-        path,
-        points=true.points[start],
-        directions=true.points[start + 1] - true.points[start],
-        points_id_to_strand_id=strand,
-        edges=np.stack([follows, follows + 1], axis=1),
-    )
 
 
 def score_alone(folder: Path, strands: Path, *arguments: object) -> dict[str, Any]:
@@ -217,12 +197,12 @@ def read_back(folder: Path, options: dict[str, Any]) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     for variant in ("stage", "lit"):
         capture, model = folder / "imported" / variant, folder / "models" / variant
-        _command("import", folder / variant, "--out", capture)
-        _command("reconstruct", capture, "--out", model, "--options", json.dumps(options))
+        run_product("import", folder / variant, "--out", capture)
+        run_product("reconstruct", capture, "--out", model, "--options", json.dumps(options))
         strands = model / "strands.npz"
         ours = score_alone(folder, strands)
         true = folder / "truth" / "strands.npz"
-        theirs = _command("evaluate", "geometry", strands, true, "--capture", capture)
+        theirs = run_product("evaluate", "geometry", strands, true, "--capture", capture)
         rows[variant] = {**ours, "difference": difference(ours, theirs)}
     return rows | baselines(folder)
 
@@ -239,15 +219,6 @@ def difference(ours: dict[str, Any], theirs: dict[str, Any]) -> float:
     ]
     consistency = theirs["connectivity"]["true"]["strand_consistency"]
     return max(*found, *(abs(ours["strand_consistency"][t] - consistency[t]) for t in THRESHOLDS))
-
-
-def _command(*words: object) -> dict[str, Any]:
-    """The JSON of one of the product's commands; raises `CommandError` with its message."""
-    command = own_command(*map(str, words), "--json")
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        raise CommandError(f"{' '.join(map(str, words))}: {done.stderr[-600:]}", done.returncode)
-    return dict(json.loads(done.stdout))
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -271,7 +242,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         path, truth = shot.make(args.cache, report)
         write_subject(Capture(path), truth, out / name)
     shutil.copyfile(SCORER, out / "score.py")
-    swept = "each projector row alone: `scanline/CAMERA/PROJECTOR_ROW.exr`" if args.rows else ""
+    swept = "; each projector row: `scanline/CAMERA/PROJECTOR_ROW.exr`" if args.rows else ""
     said = {"commit": commit, "subjects": ", ".join(names), "spp": spp, "swept": swept}
     text = (HERE / "README.md").read_text()
     for key, value in said.items():

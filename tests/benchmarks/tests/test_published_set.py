@@ -145,9 +145,3 @@ def test_a_set_read_back_agrees_with_evaluate(shoot, tmp_path) -> None:
         assert difference(ours, theirs) < 1e-6
     hidden = ours["visible"]["4mm_90deg"]["recall"], ours["all"]["1mm_10deg"]["f"]
     assert hidden[1] != ours["visible"]["1mm_10deg"]["f"]
-
-
-def test_options_give_the_rig(tmp_path) -> None:
-    text = published_set.rig_text(3, 5, 32, 16)
-    assert text.count("[[cameras]]") == 3
-    assert text.count("[[projectors]]") == 2

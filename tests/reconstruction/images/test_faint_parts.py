@@ -36,6 +36,9 @@ def test_neither_soft_outlines_nor_a_dim_wall_are_faint_hair() -> None:
     assert faint_share(soft.astype(np.float32), soft > 0.1) < LARGEST_SHARE
     assert faint_share(picture(0.0, 0.02) + np.float32(0.03), FACE) == 0.0
     assert faint_share(np.zeros_like(soft), np.zeros(FACE.shape, bool)) == 0.0
+    noise = soft.astype(np.float32) - 0.5
+    assert faint_share(noise, np.ones(FACE.shape, bool)) == 0.0
+    assert faint_share(noise[:1, :1], np.ones((1, 1), bool)) == 0.0
 
 
 def test_a_capture_is_warned_of_unless_masks_are_given(tmp_path, two_cameras) -> None:
