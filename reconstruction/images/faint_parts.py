@@ -72,7 +72,8 @@ def faint_warnings(capture: Capture, subjects: Mapping[str, Bools] | None = None
     if not found:
         return []
     return [
-        f"dark hair or other parts of the subject are below the noise of a pixel ({NOISE_FACTOR:g} "
-        f"standard deviations) and missing from the masks: at least {found} of the lit area; "
-        "expose longer, use more light, or provide hair masks (masks/CAMERA.png)"
+        "dark hair or other parts of the subject are missing from the masks, since they are below "
+        f"the noise of a pixel ({NOISE_FACTOR:g} standard deviations); about this share of the "
+        f"lit area: {found}; expose longer, use more light, or provide hair masks "
+        "(masks/CAMERA.png)"
     ]
