@@ -178,13 +178,11 @@ def baselines(folder: Path) -> dict[str, dict[str, Any]]:
         capture.rig.cameras, {n: m for n, m in masks.items() if m is not None}, head
     )
     out = {}
-    for name, strands in (
-        ("hull_vertical", hull_vertical(hull)),
-        ("hull_smooth_field", hull_smooth_field(hull, head)),
-    ):
+    filled = {"vertical": hull_vertical(hull), "smooth_field": hull_smooth_field(hull, head)}
+    for name, strands in filled.items():
         with tempfile.TemporaryDirectory() as work:
             write_strands(Path(work) / "strands.npz", strands)
-            out[name] = score_alone(folder, Path(work) / "strands.npz")
+            out[f"hull_{name}"] = score_alone(folder, Path(work) / "strands.npz")
     return out
 
 
@@ -244,10 +242,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     shutil.copyfile(SCORER, out / "score.py")
     swept = "; each projector row: `scanline/CAMERA/PROJECTOR_ROW.exr`" if args.rows else ""
     said = {"commit": commit, "subjects": ", ".join(names), "spp": spp, "swept": swept}
-    text = (HERE / "README.md").read_text()
-    for key, value in said.items():
-        text = text.replace(f"{{{key}}}", str(value))
-    (out / "README.md").write_text(text)
+    (out / "README.md").write_text((HERE / "README.md").read_text().format(**said))
     for name in names:
         progress(f"{name}: read back", 0.9)
         rows[name] = read_back(out / name, options)
@@ -266,10 +261,13 @@ BENCHMARK = Benchmark(
     (
         *(CACHE, ONLY),
         Option("folder", {"help": "of the set, new", "metavar": "SET", "type": Path, "nargs": "?"}),
-        option("--cameras", "their number", type=int, default=12),
-        option("--lights", "their number", type=int, default=24),
-        option("--side", "pixels of a picture's edge", type=int, default=256),
-        option("--spp", "paths a pixel", type=int, default=16),
-        option("--rows", "of two projectors; 0: no sweep", type=int, default=0),
+        *(
+            option(f"--{name}", help, type=int, default=value)
+            for name, help, value in (
+                *(("cameras", "their number", 12), ("lights", "their number", 24)),
+                *(("side", "pixels of a picture's edge", 256), ("spp", "paths a pixel", 16)),
+                ("rows", "of two projectors; 0: no sweep", 0),
+            )
+        ),
     ),
 )

@@ -88,20 +88,15 @@ def test_nothing_far_and_long(scorer) -> None:
         scorer.Cloud(np.full((2, 3), np.nan, "f4"), np.array([0, 2]))
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".hair"])
-def test_it_reads_what_hairstage_writes(scorer, tmp_path, suffix) -> None:
-    strands = Strands.from_list([line((0, 0, 0), (0, 0, 1)), line((1, 0, 0), (1, 1, 0), (2, 0, 0))])
-    write_strands(tmp_path / f"s{suffix}", strands)
-    points, offsets = scorer.read_strands(tmp_path / f"s{suffix}")
-    np.testing.assert_array_equal(points, strands.points)
-    assert offsets.tolist() == [0, 2, 5]
-
-
-def test_it_reads_lines_of_obj(scorer, tmp_path) -> None:
+def test_it_reads_strand_files(scorer, tmp_path) -> None:
+    strands = Strands.from_list([line((0, 0, 0), (0, 0, 1)), line((1, 0, 0), (0, 0, 1), (0, 0, 0))])
+    for suffix in (".npz", ".hair"):
+        write_strands(tmp_path / f"s{suffix}", strands)
     (tmp_path / "s.obj").write_text("v 0 0 0\nv 0 0 1\nv 1 0 0\nl 1 2\nl -1 2 1\n")
-    points, offsets = scorer.read_strands(tmp_path / "s.obj")
-    assert offsets.tolist() == [0, 2, 5]
-    assert points[2].tolist() == [1, 0, 0]
+    for suffix in (".npz", ".hair", ".obj"):
+        points, offsets = scorer.read_strands(tmp_path / f"s{suffix}")
+        np.testing.assert_array_equal(points, strands.points)
+        assert offsets.tolist() == [0, 2, 5]
 
 
 def test_a_set_read_back_agrees_with_evaluate(shoot, tmp_path) -> None:
@@ -125,12 +120,10 @@ def test_a_set_read_back_agrees_with_evaluate(shoot, tmp_path) -> None:
     folder = tmp_path / "set" / "subject"
     write_subject(stage, truth, folder)
     shutil.copyfile(SCORER, tmp_path / "set" / "score.py")
-    for variant in ("stage", "lit"):
-        capture = import_folder(folder / variant, tmp_path / variant)
-        for camera in stage.rig.cameras:
-            np.testing.assert_array_equal(capture.rig.camera(camera.name).K, camera.K)
-            assert capture.mask(camera.name).any()
-    capture = import_folder(folder / "stage", tmp_path / "again")
+    lit = import_folder(folder / "lit", tmp_path / "lit")
+    assert [s.kind for s in lit.steps] == ["all_on"]
+    capture = import_folder(folder / "stage", tmp_path / "stage")
+    assert capture.mask("left").any()
     np.testing.assert_array_equal(
         capture.light("light_1", "left")[0],
         read_exr(folder / "stage" / "images" / "left" / "light_1.exr")[0],
@@ -143,5 +136,4 @@ def test_a_set_read_back_agrees_with_evaluate(shoot, tmp_path) -> None:
         ours = score_alone(folder, tmp_path / "pred.npz", "--samples", samples or 0)
         assert 0 < ours["visible"]["1mm_10deg"]["f"] < 1
         assert difference(ours, theirs) < 1e-6
-    hidden = ours["visible"]["4mm_90deg"]["recall"], ours["all"]["1mm_10deg"]["f"]
-    assert hidden[1] != ours["visible"]["1mm_10deg"]["f"]
+    assert ours["all"]["1mm_10deg"] != ours["visible"]["1mm_10deg"]
