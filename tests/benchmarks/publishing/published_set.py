@@ -48,8 +48,8 @@ from stage_service.cli.support.commands import CommandError
 HERE = Path(__file__).resolve().parent
 SCORER = HERE.parents[2] / "examples" / "score_alone.py"
 SUBJECTS = ("wavy", "straight", "curly")
-TARGET = (0.0, 0.0, -0.02)
-WIDTH_M, DISTANCE = 0.36, 0.95
+TARGET = (0.0, 0.0, -0.03)
+WIDTH_M, DISTANCE = 0.42, 0.95
 THRESHOLDS = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
 
 
@@ -69,7 +69,7 @@ def rig_text(cameras: int, lights: int, side: int, rows: int) -> str:
         if rows
     ]
     dome = f"lights = {lights}\nradius = 1.2\nlowest_deg = -30.0"
-    return rig_file("published", dome, devices, levels(all_on=min(1.0, 6 / lights)))
+    return rig_file("published", dome, devices, levels(all_on=min(1.0, 3 / lights)))
 
 
 def write_subject(capture: Capture, truth: Path, folder: Path) -> None:
