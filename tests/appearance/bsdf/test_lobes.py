@@ -114,19 +114,6 @@ def test_absorption_only_ever_takes_light_away():
     assert before == pytest.approx(only_r)
 
 
-def test_plain_numbers_work_like_arrays():
-    vector = dr.scalar.Array3f64
-    case = Case(theta_deg=20, h=0.2, sigma_a=0.4)
-    wi, wo = vector(*case.wi), vector(*reference.direction(0.3, 2.0))
-    plain = lobes.Fibre(vector(0.4), **case.optics)
-    value, pdf = lobes.evaluate(plain, wi, wo)
-    want = reference.evaluate(lobes.Fibre(0.4, **case.optics), case.wi, np.array(wo))
-    assert value.x == pytest.approx(float(want))
-    assert pdf > 0
-    wo, pdf, weight = lobes.sample(plain, wi, 0.3, 0.6, 0.2)
-    assert weight.x == pytest.approx(lobes.evaluate(plain, wi, wo)[0].x / pdf)
-
-
 def test_every_back_end_gives_the_same():
     """LLVM and, where there is one, CUDA."""
     case = Case(theta_deg=20, h=0.2, sigma_a=0.4, tilt_deg=3)

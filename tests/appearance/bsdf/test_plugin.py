@@ -15,7 +15,6 @@ from appearance import HairAppearance, build_scene
 from appearance.bsdf import reference
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.parameters import StrandHit
-from appearance.bsdf.shading_frame import ShadingFrame
 from appearance.bsdf.strand_coordinates import strand_parameters
 from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE
@@ -231,32 +230,6 @@ def test_every_parameter_may_be_one_per_strand(tuft):
         assert on_it.any()
         want = evaluate(alone, si, wo)
         assert got[:, on_it] == pytest.approx(want[:, on_it], rel=1e-4, abs=1e-6)
-
-
-def test_a_table_that_is_the_same_everywhere_costs_no_lookup(tuft):
-    """The kernel is that of a constant: no strand is ever looked up."""
-    _, curves, si, _ = tuft
-    same = mi.TensorXf(np.full((5, 4, 3, 3), 0.7, np.float32))
-    bsdf = hair(sigma_a=same, rotation=mi.TensorXf(np.zeros((5, 4, 3, 2), np.float32)), **curves)
-    place = StrandHit(bsdf.parameters.strands, si, si.is_valid())
-    assert np.array(bsdf.parameters.fibre(place).sigma_a)[:, 0] == pytest.approx([0.7] * 3)
-    assert bsdf.parameters.frame(place) == ShadingFrame(None, None)
-    assert not {"strand", "along", "normal"} & set(vars(place))
-    parameters = mi.traverse(bsdf)
-    changed = np.full((5, 4, 3, 3), 0.7, np.float32)
-    changed[2] = 1.0
-    parameters["sigma_a"] = mi.TensorXf(changed)
-    parameters.update()
-    got = np.array(
-        bsdf.parameters.fibre(StrandHit(bsdf.parameters.strands, si, si.is_valid())).sigma_a
-    )
-    assert len(np.unique(got.round(4))) > 2
-    parameters["sigma_a"] = same
-    parameters.update()
-    dr.enable_grad(parameters["sigma_a"])
-    total = dr.sum(dr.sum(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), si.is_valid())))
-    dr.backward(total)
-    assert np.count_nonzero(np.array(dr.grad(parameters["sigma_a"]))) > 30
 
 
 def test_a_corrective_turns_the_shading_frame_about_the_strands_own_normals(tuft):

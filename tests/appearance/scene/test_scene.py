@@ -1,6 +1,5 @@
 """Scenes: curves through the strands' points, materials, and conventions."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -121,20 +120,6 @@ def test_other_materials_share_the_geometry(small):
     colour = render_olat(skin, camera, lights, spp=4, max_depth=1)[0][floor].mean(0)
     assert colour[0] < 5e-3 * colour[1]
     assert colour[2] == pytest.approx(2 * colour[1], rel=5e-3)
-
-
-def test_another_hair_material_runs_in_the_same_kernel(small):
-    scene = build_scene(small.no_hair, None, hair=HAIR)
-    scenes = [
-        scene.with_hair(HairAppearance((s, 1.0, 2.0), 0.1 + s, 0.2)) for s in np.arange(8) / 9
-    ]
-    si = dr.zeros(mi.SurfaceInteraction3f, 16)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        for s in scenes:
-            dr.eval(s.hair_bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)))
-        kernels = {k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])}
-    assert len(kernels) == 1
 
 
 @pytest.mark.parametrize("bsdf", ["extended_hair", pytest.param("hair", marks=pytest.mark.slow)])

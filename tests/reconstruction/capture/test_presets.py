@@ -178,6 +178,7 @@ def test_humanolat(tmp_path: Path) -> None:
     assert read_preset("humanolat", PresetFiles(pose), mean).sensor == Sensor(response="srgb")
 
 
+@pytest.mark.slow
 def test_the_command_imports_a_take_of_avif(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """By `hairstage import`; AVIF has a power of 2.2 without sRGB's toe."""
     files = faceolat(tmp_path, 0)

@@ -290,6 +290,7 @@ def test_a_flat_table_has_no_contrast() -> None:
     assert Reflection(np.ones(8), np.ones(72)).contrast == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_scores_are_made_and_decided_without_many_times_their_memory() -> None:
     """Of 20 megapixels there are half a million points: 1 GB of scores, 10 GB beside them."""
     rng = np.random.default_rng(0)

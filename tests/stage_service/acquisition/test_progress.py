@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from reconstruction import Step
 from stage_service.acquisition.progress import RunProgress
-from stage_service.acquisition.states import Progress, Waiting
-from stage_service.devices.cameras.interface import Busy
+from stage_service.acquisition.states import Progress
 
 STEPS = [
     *(Step(i, "olat", 0.01, light=f"light_{i:03d}") for i in range(10)),
@@ -79,32 +78,3 @@ def test_a_run_of_the_box_is_as_far_as_its_slowest_camera():
     run.end_run({"a": 5, "b": 3})
     assert run.now().frames == {"a": 8, "b": 6}
     assert not run.now().by_box
-
-
-def test_what_busy_cameras_report_predicts_the_rest_and_what_is_waited_for():
-    clock = Watch()
-    steps = [Step(0, "all_on", 0.02), *STEPS, *(Step(30 + i, "tracking", 0.02) for i in range(4))]
-    run = RunProgress(steps, {"a": 0, "b": 0}, lambda _: None, clock)
-    run.begin(steps[0])
-    clock.now += 1.0
-    assert run.now().waiting is None, "a second is no wait"
-    clock.now += 19.0
-    run.responded("a")
-    assert (run.now().waiting.doing, run.now().seconds_left) == ("", None)
-    rendering = Busy("rendering camera 2 of 2", 60.0, {"tracking": 15.0})
-    run.waiting({"b": rendering})
-    now = run.now()
-    assert now.waiting == Waiting(cameras=("b",), seconds=20, doing="rendering camera 2 of 2")
-    expected = 60.0 + 30 * 0.01 + 4 * 15.02
-    assert now.seconds_left == round(expected, 1)
-    assert now.share == round(20 / (20 + expected), 4)
-    clock.now += 60.0
-    run.done(steps[0])
-    for step in STEPS:
-        run.begin(step)
-        clock.now += 0.5
-        run.done(step)
-    now = run.now()
-    assert now.waiting is None
-    assert now.seconds_left == round(4 * 15.02, 1)
-    assert now.share == round(95 / (95 + 4 * 15.02), 4)

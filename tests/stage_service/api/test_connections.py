@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import resource
@@ -109,26 +108,6 @@ def test_a_unix_socket_is_for_user_and_group(tmp_path):
         with pytest.raises(OSError, match="another service"):
             listening(unix=path)
     listening(unix=path).close()  # the one before has died
-
-
-def test_responses_are_sent_at_once():
-    """Without TCP_NODELAY the second of two small writes waits 40 ms for an acknowledgement."""
-
-    async def accepted() -> int:
-        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-
-        def take(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            connection = writer.get_extra_info("socket")
-            found.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
-            writer.close()
-
-        async with await asyncio.start_server(take, sock=listening()) as server:
-            _, client = await asyncio.open_connection(*server.sockets[0].getsockname())
-            delay_off = await found
-            client.close()
-            return delay_off
-
-    assert asyncio.run(accepted()) == 1
 
 
 def test_a_burst_of_connections_leaves_descriptors_too(rig_file, tmp_path):

@@ -300,14 +300,14 @@ def test_a_head_that_is_uploaded_twice_at_once_is_one_of_the_two(http):
     def put(head: bytes) -> None:
         responses.append(http.put("/uploads/anna/head.obj", content=head).status_code)
 
-    for _ in range(10):
+    for _ in range(4):
         threads = [threading.Thread(target=put, args=(head,)) for head in heads]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
         assert (http.service.root / "uploads" / "anna" / "head.obj").read_bytes() in heads
-    assert responses == 20 * [200]
+    assert responses == 8 * [200]
 
 
 def test_concurrent_deletions_delete_once(http):
@@ -318,7 +318,7 @@ def test_concurrent_deletions_delete_once(http):
     def delete(path: str) -> None:
         responses.append(http.delete(path).status_code)
 
-    for _ in range(10):
+    for _ in range(4):
         for name in ("a", "b", "c"):
             (root / "uploads" / name / "masks").mkdir(parents=True)
             place = root / "trash" / f"20260101-000000-{name}"
@@ -336,7 +336,7 @@ def test_concurrent_deletions_delete_once(http):
             for thread in threads:
                 thread.join()
     assert set(responses) <= {200, 404}
-    assert responses.count(404) <= 30
+    assert responses.count(404) <= 12
     assert http.get("/trash").json() == http.get("/uploads").json() == []
 
 

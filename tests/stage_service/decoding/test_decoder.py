@@ -81,24 +81,6 @@ def test_a_map_is_read_as_it_was_in_the_service_itself(decoder, tmp_path):
     np.testing.assert_array_equal(decoder.map_weights(data, "m", "exr", 30.0, LIGHTS), expected)
 
 
-@pytest.mark.parametrize(
-    ("data", "why"),
-    [
-        (bombs.obj(3_800_000), "3,800,000 faces; at most 1,000,000 are read"),
-        (bombs.polygon(15_000_000), "line 4: more than 65,536 characters"),
-        (b"v " + b"9" * (30 * MB), "line 1: more than 65,536 characters"),
-    ],
-)
-def test_a_head_of_too_many_triangles_is_refused(decoder, data, why):
-    decoder.start()
-
-    def refused() -> None:
-        with pytest.raises(Undecodable, match="^head.obj.*" + why):
-            decoder.head(data, "head.obj")
-
-    assert peak_mb(refused) < 60
-
-
 def test_a_file_that_needs_more_memory_than_its_limit_is_refused(decoder, tmp_path):
     file = tmp_path / "zeros.exr"
     file.write_bytes(bombs.exr(4096, 2048))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from urllib.parse import parse_qs, urlsplit
 
-import bombs
 import cv2
 import numpy as np
 import pytest
@@ -113,23 +112,6 @@ def test_light_that_cannot_be_made_is_refused_with_what_is_wrong(http):
     assert http.post(f"{base}/few", json={"weights": {"4": [1, 1]}}).status_code == 422
     assert http.get(f"{base}/visibility/400").status_code == 404
     assert http.get(f"{base}/table").status_code == 404  # no material was fitted
-
-
-def test_a_map_that_unpacks_to_gigabytes_takes_no_memory_of_the_service(http):
-    """0.4 MB for 5.3 GB, 12.7 MB for 12 GB."""
-    http.get("/view/models/bristles/lighting").raise_for_status()
-    for name, data, size in (
-        ("a.exr", bombs.exr(8000, 4000), "8000 × 4000"),
-        ("a.hdr", bombs.radiance(20000, 10000), "20000 × 10000"),
-    ):
-        expected = f"{name}: the image unpacks to {size} pixels; at most 8,388,608 are read"
-
-        def refused(name: str = name, data: bytes = data, expected: str = expected) -> None:
-            response = http.put(f"/view/models/bristles/environments/{name}", content=data)
-            assert response.status_code == 422
-            assert response.json()["detail"] == expected
-
-        assert bombs.peak_mb(refused) < 8 * len(data) / 1e6 + 40
 
 
 def test_a_view_that_is_none_is_refused_before_a_path_is_traced(http):
