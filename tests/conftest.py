@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import certifi
 import pytest
 
 # Before NumPy is loaded: on shared cores OpenBLAS's threads spin as they wait for one another.
@@ -36,6 +37,7 @@ settings.load_profile("untimed")
 FIRST = (
     "system",
     "faults",
+    "stage_service/captures",
     "stage_service/web",
     "test_examples.py",
     "contracts",
@@ -61,6 +63,15 @@ def own_token(tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.mktemp("user") / "token"
     file.write_text("a token of the tests\n")
     os.environ["HAIRSTAGE_TOKEN_FILE"] = str(file)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_authority(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Tests connect to this machine alone: a client loads one certificate, not all there are."""
+    end = "-----END CERTIFICATE-----"
+    file = tmp_path_factory.mktemp("certificates") / "one.pem"
+    file.write_text(certifi.contents().partition(end)[0] + end + "\n")
+    certifi.where = lambda: str(file)
 
 
 @pytest.fixture
