@@ -91,7 +91,7 @@ def render_olat(
     """
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
     single, mix = components(lights)
-    out = _rendered(_View(scene, camera, single, index), OlatOptions(**options), seed)
+    out = _rendered(_View(scene, camera, single, index), OlatOptions(**options), seed, _Light())
     field = field_of(scene, camera, index)
     if field is not None:
         out = field.lit(out, single)
@@ -110,12 +110,33 @@ def render_indirect(
 ) -> Floats:
     """Indirect light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    Uniform fibres have the BSDF's mean over parts of their width, which halves the variance. Other
-    hair has the BSDF of `render_olat`.
+    Uniform fibres have the BSDF's mean over parts of their width (`FarField`), with less noise.
+    Other hair has the BSDF of `render_olat`.
     """
     single, mix = components(lights)
     view = _View(scene, camera, single, pixel_indices(camera, pixels))
-    return mixed(mix, _rendered(view, OlatOptions(**options), seed, indirect=True))
+    part = _Light(direct=False, mean_width=True)
+    return mixed(mix, _rendered(view, OlatOptions(**options), seed, part))
+
+
+def render_direct(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    pixels: ArrayLike,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Floats:
+    """Direct light of `render_olat`, `(L, P, 3)`, without the scene's field.
+
+    With the mean BSDF of `render_indirect`: a quarter of the paths for the same noise. What is
+    seen and lit of a fibre are not independent parts of its width: 1 % too bright on the demo.
+    """
+    single, mix = components(lights)
+    view = _View(scene, camera, single, pixel_indices(camera, pixels))
+    part = _Light(mean_width=True)
+    return mixed(mix, _rendered(view, OlatOptions(max_depth=1, **options), seed, part))
 
 
 def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
@@ -123,6 +144,13 @@ def spread_out(radiance: Floats, index: Ints, camera: Camera) -> Floats:
     out = np.zeros((len(radiance), camera.height * camera.width, 3), np.float32)
     out[:, index] = radiance
     return out.reshape(-1, camera.height, camera.width, 3)
+
+
+class _Light(NamedTuple):
+    """The light that is rendered: with that of first vertices, and with which BSDF."""
+
+    direct: bool = True
+    mean_width: bool = False
 
 
 class _View(NamedTuple):
@@ -134,12 +162,12 @@ class _View(NamedTuple):
     pixels: Ints
 
 
-def _rendered(view: _View, options: OlatOptions, seed: int, indirect: bool = False) -> Floats:
-    """`(L, P, 3)`: all light, or without that of the first vertices."""
+def _rendered(view: _View, options: OlatOptions, seed: int, light: _Light) -> Floats:
+    """`(L, P, 3)` of `light`."""
     index, count, camera = view.pixels, len(view.lights), view.camera
     out = np.zeros((count, len(index), 3), np.float32)
     if out.size:
-        plan = _plan(view, options, seed, indirect)
+        plan = _plan(view, options, seed, light)
         # each tile is spread over the whole image
         tiles = tile_count(index, FILM_BYTES * count, options.memory)
         for k in range(tiles):
@@ -161,8 +189,7 @@ class _Plan:
     """The input of a rendering, and its sampling.
 
     `counts`: lights sampled at the first and at later vertices. `dim (L,)`: contributions below
-    this radiance cast their shadow ray with a probability in proportion. `indirect` leaves out the
-    light of first vertices.
+    this radiance cast their shadow ray with a probability in proportion.
     """
 
     scene: HairScene
@@ -171,15 +198,15 @@ class _Plan:
     counts: tuple[int, int]
     limits: PathLimits
     dim: Floats
-    indirect: bool
+    light: _Light
 
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> Floats:
         """Mean over `spp` paths a pixel: `(L, P, 3)`."""
         count, slots = len(self.lights), opaque_index(len(index))
         film = dr.zeros(mi.Float, 3 * count * len(index))
-        surface = Surface(self.scene, mean_width=self.indirect)
+        surface = Surface(self.scene, mean_width=self.light.mean_width)
         bank, dim = PackedLights.of(self.lights), mi.Float(self.dim)
-        gather = _Gather(surface, film, slots, bank, dim, self.counts, self.indirect)
+        gather = _Gather(surface, film, slots, bank, dim, self.counts, self.light.direct)
         follow(surface, self.camera, index, PathPlan(spp, seed, self.limits), gather)
         image = np.array(film).reshape(count, 3, len(index)).transpose(0, 2, 1)
         return np.asarray(image / np.float32(spp), dtype=np.float32)
@@ -204,13 +231,13 @@ class _Plan:
         return np.asarray(np.sqrt(squares.mean(1) / 2), np.float32)
 
 
-def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan:
+def _plan(view: _View, options: OlatOptions, seed: int, light: _Light) -> _Plan:
     scene, camera, lights, index = view
     wanted = (options.first_lights, options.deep_lights)
     first, deep = (len(lights) if n is None else min(n, len(lights)) for n in wanted)
     depth = options.max_depth or bounce_limit(scene, camera, pixels=index, seed=seed).depth
     none = np.zeros(len(lights), np.float32)
-    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none, indirect)
+    plan = _Plan(scene, camera, lights, (first, deep), PathLimits(depth), none, light)
     if options.thrift > 0:
         spread = plan.spread(index, options.spp, seed)
         plan = replace(plan, dim=np.float32(options.thrift) * spread)
@@ -221,7 +248,7 @@ def _plan(view: _View, options: OlatOptions, seed: int, indirect: bool) -> _Plan
 class _Gather:
     """Light from the bank, or a systematic sample of it, at a path's vertex.
 
-    If `indirect`, first vertices gather none.
+    Unless `direct`, first vertices gather none.
     """
 
     surface: Surface
@@ -230,11 +257,11 @@ class _Gather:
     bank: PackedLights
     dim: Any
     counts: tuple[int, int]
-    indirect: bool
+    direct: bool
 
     def __call__(self, si: Any, paths: Paths) -> None:
         total, active, slot = opaque_index(self.bank.count), paths.active, paths.slot
-        if self.indirect:
+        if not self.direct:
             active = active & (paths.depth > 0)
         count = dr.select(paths.depth == 0, *(opaque_index(n) for n in self.counts))
         stride = mi.Float(total) / mi.Float(count)

@@ -26,7 +26,7 @@ class Cost(NamedTuple):
 
 
 COSTS = {
-    "lights": Cost(2.5, 0.8e-5, 8e-7, 6.0),
+    "lights": Cost(2.5, 0.8e-5, 6e-7, 6.0),
     "lights_together": Cost(0.3, 2e-6, 0.0, 1.0),
     "sweep": Cost(0.2, 6e-6, 0.0, 1.0),
 }

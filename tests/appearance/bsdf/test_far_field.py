@@ -74,8 +74,8 @@ def test_the_table_on_the_device_gives_the_near_fields_mean_over_a_part_of_the_w
         for a in ((theta_i, gamma), (theta_o, gamma + turn))
     )
     got = np.array(FarField(hair).towards(wi)(wo, mi.Bool(True))).T
-    np.testing.assert_allclose(got, want, rtol=0.1, atol=2e-3)
-    assert got.mean() == pytest.approx(np.mean(want), rel=0.01)
+    np.testing.assert_allclose(got, want, rtol=0.06, atol=2e-3)
+    assert got.mean() == pytest.approx(np.mean(want), rel=0.002)
 
 
 def test_directions_along_the_fibre_and_no_directions_are_finite_or_left_alone():

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from benchmarks.renderers.path_reference import PathReference
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.render import olat
 from appearance.render.coverage import covered_pixels
-from appearance.render.olat import render_indirect
+from appearance.render.olat import render_direct, render_indirect
 from appearance.scene.hair_appearance import DiffuseHair
 from reconstruction import Camera, Light, Strands, read_exr
 
@@ -148,18 +149,23 @@ def test_indirect_light_is_what_direct_light_lacks(small, tufted):
         render_olat(scene, camera, lights, spp=256, max_depth=n, seed=2, pixels=pixels)
         for n in (1, 4)
     )
-    indirect = render_indirect(scene, camera, lights, pixels, spp=64, max_depth=4, seed=1)
+    indirect = render_indirect(scene, camera, lights, pixels, spp=256, max_depth=4, seed=1)
     np.testing.assert_allclose((direct + indirect).mean((1, 2)), whole.mean((1, 2)), rtol=0.02)
     flat = build_scene(small.no_hair, small.plane(), hair=HAIR)
     assert not render_indirect(flat, camera, lights, pixels, spp=4, max_depth=4).any()
 
 
-@pytest.mark.slow
-def test_far_field_fibres_scatter_less(small, monkeypatch):
-    """Beside fibres that answer where they are met: the same light, and half of the noise.
-
-    In hair as dense as this the mean over the whole width has 4 % too much light.
-    """
+@pytest.mark.parametrize(
+    ("light", "spp", "noise"),
+    [
+        pytest.param(partial(render_indirect, max_depth=6), 64, 0.75, marks=pytest.mark.slow),
+        (render_direct, 36, 0.6),
+    ],
+)
+def test_fibres_that_scatter_the_mean_of_a_part_of_their_width(
+    small, monkeypatch, light, spp, noise
+):
+    """Beside fibres that scatter as at the hit: the same light, and less noise."""
     strands = small.tuft()
     dense = replace(strands, radius=3 * strands.radius)
     scene, camera, lights = (
@@ -171,18 +177,15 @@ def test_far_field_fibres_scatter_less(small, monkeypatch):
 
     def pictures():
         return np.stack(
-            [
-                render_indirect(scene, camera, lights, pixels, spp=64, max_depth=6, seed=s)
-                for s in range(8)
-            ]
+            [light(scene, camera, lights, pixels, spp=spp, seed=s, thrift=0) for s in range(8)]
         )
 
     width = pictures()
     monkeypatch.setattr(scene.hair_bsdf.parameters, "far_field", None)
     point = pictures()
-    assert width.mean() == pytest.approx(point.mean(), rel=0.025)
-    np.testing.assert_allclose(width.mean((0, 2)), point.mean((0, 2)), rtol=0.06)
-    assert width.var(axis=0, ddof=1).mean() < 0.6 * point.var(axis=0, ddof=1).mean()
+    assert width.mean() == pytest.approx(point.mean(), rel=0.01)
+    np.testing.assert_allclose(width.mean((0, 2)), point.mean((0, 2)), rtol=0.03)
+    assert width.var(axis=0, ddof=1).mean() < noise * point.var(axis=0, ddof=1).mean()
 
 
 def test_same_seed_same_bytes(tufted):
@@ -200,7 +203,8 @@ def test_pixels_of_a_rendering_have_independent_noise(tufted, spp):
     runs = [render_olat(scene, camera, lights, spp=spp, seed=s, pixels=twice) for s in range(32)]
     noise = np.sqrt(np.stack(runs[::2])) - np.sqrt(np.stack(runs[1::2]))
     one, other = np.split(noise[..., 0], 2, axis=2)
-    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.03
+    # 0.02 is its standard deviation over seeds; streams a fixed step apart had up to 0.4
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.08
 
 
 def test_pixels_of_light_that_is_not_finite_are_rendered_again_or_named(
