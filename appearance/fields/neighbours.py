@@ -11,6 +11,10 @@ from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 
 RADIAL = 6
 """Neighbours of a light with radial weights, about as many as Photobooth's."""
+KRIGED = 24
+"""Neighbours of a light whose samples are kriged."""
+SAME = 1e-3
+"""Radians between the directions of equal lights."""
 
 
 def camera_weights(directions: AnyFloats, towards: AnyFloats) -> Array:
@@ -55,6 +59,24 @@ def light_weights(directions: AnyFloats, towards: AnyFloats) -> tuple[Ints, Floa
     left = np.maximum(reach - near, 1e-6 * (reach + 1e-6))  # equal if all are equally far
     weight = (left / np.maximum(near, 1e-5)) ** 2
     return order, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def kriging_weights(directions: AnyFloats, towards: AnyFloats) -> tuple[Ints, Floats]:
+    """The lights `(k,)` near the direction `towards (3,)`, and weights of sum 1, some negative.
+
+    Unit `directions (L, 3)`. Ordinary kriging by the angle as variogram, whose scale has no effect,
+    of the `KRIGED` nearest; a light in the same direction alone.
+    """
+    angle = np.arccos(np.clip(directions @ towards, -1, 1))
+    near = np.argsort(angle, kind="stable")[:KRIGED]
+    if angle[near[0]] < SAME:
+        return near[:1], np.ones(1, np.float32)
+    count = len(near)
+    system = np.ones((count + 1, count + 1))
+    system[:count, :count] = np.arccos(np.clip(directions[near] @ directions[near].T, -1, 1))
+    np.fill_diagonal(system, 0)
+    weights = np.linalg.lstsq(system, np.append(angle[near], 1), rcond=None)[0][:count]
+    return near, (weights / weights.sum()).astype(np.float32)
 
 
 def _triangles(directions: AnyFloats) -> Ints:

@@ -20,7 +20,7 @@ from appearance.metrics.scores import (
 )
 from appearance.model.baselines import NearestCameras, other_lights, three_nearest
 from appearance.model.fitted_model import FittedModel
-from appearance.model.interpolated import GuidedFrames
+from appearance.model.from_frames import FromFrames, NewViews
 from appearance.model.options import AssessOptions
 from appearance.observations import HeldOut, Observed, observe_hair
 from appearance.render.smoothed import olat_smoothed
@@ -32,7 +32,7 @@ from appearance.sun_fit.roughness_and_colour import fit_diffuse
 from reconstruction import Camera, Capture, Light, Model, Progress, Stage, silent
 from reconstruction.arrays import AnyFloats, Array, Bools
 
-FITS = ("ours", "sun_fit", "inverse_rendering", "without_field", "guided_frames")
+FITS = ("ours", "sun_fit", "inverse_rendering", "without_field", "from_frames")
 """Methods in the results that are not baselines."""
 OWN_FRAMES = "three_nearest_own_frames"
 """A reference with the held-out camera's own frames, without a warning."""
@@ -44,6 +44,8 @@ INTERPOLATED = {
 SHOWN = {"held_out_lights": 4, "held_out_camera": 2}
 """Rows of the comparison by group."""
 MAX_DEPTH = 16
+FRAMES_SPP = 8
+"""Of the training cameras' images for `FromFrames`."""
 BASELINE_PIXELS, BASELINE_LIGHTS = 100, 48  # of each camera: what mean colour and albedo come from
 
 
@@ -73,7 +75,7 @@ def assess(
     out. "rendered" names the fit of the material, "lpips" the reason if that score is missing. The
     methods are "ours", the parts of it ("sun_fit", "inverse_rendering", "without_field"), and
 
-    - "guided_frames", of held-out lights: see `GuidedFrames`
+    - "from_frames": see `FromFrames`; left out without another camera that shows hair
     - "mean_colour": the mean over training frames and hair pixels
     - "diffuse": Lambertian fibres on our strands, with the albedo that reproduces that mean
     - "three_nearest", of held-out lights: the camera's frames under the three nearest training
@@ -144,6 +146,7 @@ class _Comparison:
                         image.frames["ours"] = image.frames[rendered]
                     image.frames["mean_colour"] = np.broadcast_to(colour, (*image.mask.shape, 3))
                     groups[group].append(image)
+            progress("relighting frames", 0.5 + 0.4 * k)
             self._interpolate(groups[group], scene, own=group == "held_out_lights")
             if not groups[group]:
                 stage.warn(f"{group}: no frame of it shows lit hair: nothing is compared")
@@ -227,13 +230,27 @@ class _Comparison:
     def _interpolate(self, images: Sequence[_Compared], scene: HairScene, *, own: bool) -> None:
         """Add the baselines made of frames; `own` where the camera is one of the training's."""
         training, views = self.training.olat_lights(), dict[str, NearestCameras | None]()
+        if not images:
+            return
+        frames = FromFrames.of(self.fitted, self.model, self.training)
+        lights = self.fitted.lights(list({image.light.name: None for image in images}))
+        relit: NewViews | None = None
+        if not own and len(frames.field.views) > 1:
+            sampling = Sampling(FRAMES_SPP, MAX_DEPTH, self.seed)
+            cameras = [v.camera for v in frames.field.views]
+            lit = {c.name: olat_smoothed(scene, c, lights, sampling) for c in cameras}
+            relit = NewViews.of(frames, [[light] for light in lights], lit)
         for image in images:
+            base, number = image.frames["ours"], [x.name for x in lights].index(image.light.name)
+            shot = frames.view(image.camera)
+            if shot is not None:
+                image.frames["from_frames"], _ = frames.relit(shot, [lights[number]], base)
+            elif relit is not None:
+                image.frames["from_frames"], _ = relit(image.camera, base, number)
             camera, light = image.camera, image.light
             mixed = three_nearest(self.capture, camera.name, light, training)
             image.frames["three_nearest" if own else OWN_FRAMES] = mixed
             if own:
-                guided = GuidedFrames(scene, self.fitted, self.training, camera, image.mask)
-                image.frames["guided_frames"] = guided(image.frames["ours"], [light])
                 continue
             if camera.name not in views:
                 mask = self.model.mask(camera.name, "hair", self.capture)

@@ -87,7 +87,7 @@ class NearestCameras:
             for c in training.rig.cameras
             if c.name != camera.name and any(training.has_light(n, c.name) for n in lights)
         ]
-        points, met = _first_hits(scene, camera, mask)
+        points, met = first_hits(scene, camera, mask)
         if not others or not met.any():
             return None
         nearest, by_angle = _nearest(np.array([c.center for c in others]), camera.center, CAMERAS)
@@ -135,7 +135,7 @@ def _nearest(positions: Array, own: Array, most: int) -> tuple[Ints, Array]:
     return nearest, weights / weights.sum()
 
 
-def _first_hits(scene: HairScene, camera: Camera, mask: Bools) -> tuple[Array, Bools]:
+def first_hits(scene: HairScene, camera: Camera, mask: Bools) -> tuple[Array, Bools]:
     """Points `(H, W, 3)`, metres, that rays through the pixels' centres meet, and where `(H, W)`.
 
     Pixels of `mask` whose ray misses the hair take the depth of the nearest pixel that meets it.

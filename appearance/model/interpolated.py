@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
 from appearance.bsdf.maps import MappedStrands
 from appearance.fields.hits import find_hits
-from appearance.fields.interpolation import FLOOR, HITS, Interpolation, irradiance, weighted
-from appearance.fields.neighbours import light_weights
+from appearance.fields.interpolation import HITS, Interpolation
 from appearance.fields.reflectance import gather
 from appearance.fields.search import searched
 from appearance.model.fitted_model import FittedModel
@@ -21,8 +19,6 @@ from appearance.observations import HeldOut
 from appearance.render.coverage import coverage
 from appearance.render.environment_maps import check_environment, subdivided
 from appearance.render.mixed import Environment
-from appearance.render.olat import render_olat
-from appearance.scene.hair_scene import HairScene
 from reconstruction import (
     Camera,
     Capture,
@@ -34,7 +30,7 @@ from reconstruction import (
     Strands,
     silent,
 )
-from reconstruction.arrays import AnyFloats, Array, Bools, Floats
+from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.options import options
 from reconstruction.report.progress import part_of
 
@@ -42,14 +38,6 @@ ROWS = 16
 """Rows of cells of an environment map, a far light each: 11°, the spacing of 331 lights."""
 FAR = 1e3
 """Metres to the lights of an environment."""
-GUIDE = 4
-"""Paths a pixel of the guide's images, which are blurred."""
-SAME = 0.999
-"""Weight from which a captured light coincides with a new one."""
-_DARK = 1e-12
-"""W/m² of a dark light."""
-EXTENT = 12.0
-"""The hair's extent (the root of its area) over the guide's blur."""
 
 
 @options
@@ -152,84 +140,6 @@ def with_samples(
     left = np.clip(1 - known / subject, 0, 1)
     flat[pixels] = known[:, None] * radiance + left[:, None] * flat[pixels]
     return image, {"hair_unseen": float(1 - known.sum() / max(float(hair.sum()), 1e-6))}
-
-
-@dataclass(frozen=True, eq=False)
-class GuidedFrames:
-    """A camera's own frames in `capture`, relit by the model.
-
-    Each frame of the nearest captured lights is multiplied by the ratio of the model's images under
-    the new and the captured light, both over irradiance and blurred by a twelfth of the hair's
-    extent, against errors of the strands. `FLOOR` bounds the ratio. `scene` is that of `fitted`,
-    `mask (H, W)` the hair's.
-    """
-
-    scene: HairScene
-    fitted: FittedModel
-    capture: Capture
-    camera: Camera
-    mask: Bools
-
-    def __call__(self, base: AnyFloats, lights: Sequence[Light]) -> Floats:
-        """The image `base (H, W, 3)`, its hair from frames, under all `lights` together.
-
-        `base` stays where all frames are saturated. Raises `ModelError` for a camera without frames
-        or hair.
-        """
-        name, capture, mask = self.camera.name, self.capture, self.mask
-        if not mask.any():
-            raise ModelError(f"{name}: its hair mask is empty")
-        shot = [n for n in capture.olat_lights() if capture.has_light(n, name)]
-        if not shot:
-            raise ModelError(f"{name}: the capture has no frame of it under a single light")
-        middle = self.fitted.strands.points.mean(axis=0)
-        captured, new = (
-            _directions(np.array([x.position for x in many]) - middle)
-            for many in ([capture.rig.light(n) for n in shot], lights)
-        )
-        order, weights = light_weights(captured, new)
-        total = np.zeros((int(mask.sum()), 3), np.float32)
-        for k, light in enumerate(lights):
-            names = [shot[j] for j in order[k]]
-            near = self.fitted.lights(names)
-            frames = np.full((len(names), *total.shape), np.nan, np.float32)
-            for i, n in enumerate(names):
-                frame, saturated = capture.light(n, name)
-                frames[i] = np.where(saturated[mask][:, None], np.nan, frame[mask])
-            given = _irradiances(near, middle)
-            frames = np.where(given > _DARK, frames / given, np.nan)
-            if weights[k].max() < SAME:
-                guide = self._shown([*near, light], middle)
-                guide += FLOOR * guide.mean()
-                frames *= guide[-1] / guide[:-1]
-            total += weighted(frames, weights[k]) * _irradiances([light], middle)[0]
-        image = np.array(base, np.float32)
-        image[mask] = np.where(np.isfinite(total), total, image[mask])
-        return image
-
-    def _shown(self, lights: Sequence[Light], middle: AnyFloats) -> Floats:
-        """The model's blurred images `(L, P, 3)` of the mask's pixels, over irradiance."""
-        sigma = float(np.sqrt(self.mask.sum())) / EXTENT
-        pixels = np.flatnonzero(self.mask)
-        lit = render_olat(self.scene, self.camera, lights, spp=GUIDE, pixels=pixels)
-        share = cv2.GaussianBlur(self.mask.astype(np.float32), (0, 0), sigma)
-        out = np.empty_like(lit)
-        for k, values in enumerate(lit):
-            image = np.zeros((*self.mask.shape, 3), np.float32)
-            image[self.mask] = values
-            blurred = cv2.GaussianBlur(image, (0, 0), sigma)
-            out[k] = blurred[self.mask] / share[self.mask][:, None]
-        return out / _irradiances(lights, middle)
-
-
-def _directions(vectors: AnyFloats) -> Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), float)
-
-
-def _irradiances(lights: Sequence[Light], point: AnyFloats) -> Floats:
-    """Of each light at a point `(L, 1, 3)`."""
-    at = np.asarray(point, np.float32)[None]
-    return np.stack([np.maximum(irradiance(x, at), _DARK) for x in lights])
 
 
 def _source(interpolation: Interpolation, camera: Camera) -> Any:

@@ -27,7 +27,7 @@ PICTURES = {
     "inverse_rendering": "inverse rendering",
     "sun_fit": "Sun's fit",
     "without_field": "without the field",
-    "guided_frames": "nearest frames × model ratio",
+    "from_frames": "captured frames, relit",
     "diffuse": "diffuse",
     "mean_colour": "mean colour",
     "three_nearest": "three nearest lights",

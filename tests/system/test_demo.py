@@ -57,7 +57,7 @@ def test_the_demo_leaves_every_figure_and_no_process(stage):
     if results["images"]["rendered"] == "inverse_rendering":
         fits += ["sun_fit", "inverse_rendering"]
     for group, of_frames in (
-        ("held_out_lights", ("three_nearest", "guided_frames")),
+        ("held_out_lights", ("three_nearest", "from_frames")),
         ("held_out_camera", ("nearest_cameras", "three_nearest_own_frames")),
     ):
         for method in (*fits, *of_frames):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from stage_service.cli.support.commands import Commands, Output, add_command, progress_bar
 
 if TYPE_CHECKING:
-    from appearance import Environment, FittedModel, Sampling
+    from appearance import Environment, FittedModel, HairScene, Sampling
     from appearance.model.interpolated import InterpolationOptions, Pose
     from reconstruction import Camera, Capture, Light, Model, Progress, Strands
     from reconstruction.arrays import Floats
@@ -53,9 +53,14 @@ def add(commands: Commands) -> None:
     )
     render.add_argument(
         "--guide",
-        choices=("kajiya_kay", "none", "model"),
-        help="guide of an interpolation: kajiya_kay (default), none, or model: the ratio of our "
-        "renders, for a camera of the capture",
+        choices=("kajiya_kay", "none"),
+        help="guide of an interpolation; default: kajiya_kay",
+    )
+    render.add_argument(
+        "--from-frames",
+        type=Path,
+        metavar="CAPTURE",
+        help="the hair from this capture's frames as far as they show it, the rest from the model",
     )
     render.add_argument(
         "--strands",
@@ -85,8 +90,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Render MODEL's strands with its fitted appearance (hair maps and estimated lights, if it has
     them), in the pose of its capture or of other --strands. --field interpolation interpolates the
-    hair between captured frames. --turntable, --turning-light and strands of several poses write a
-    WebP animation with smoothed indirect light.
+    hair between captured frames; --from-frames relights a captured subject. --turntable,
+    --turning-light and strands of several poses write a WebP animation with smoothed indirect
+    light.
     """
     with progress_bar("render") as progress:
         done = _render(args, progress)
@@ -112,16 +118,21 @@ def _render(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise ValueError(f"--spp {args.spp}: expected 1 or more")
     if args.guide and args.field != "interpolation":
         raise ValueError("--guide needs --field interpolation")
-    only_lights = args.light and args.environment is None and args.strands is None
-    if args.guide == "model" and not (only_lights and args.camera):
-        raise ValueError(
-            "--guide model: for a --camera of the capture, in its pose and under --light"
-        )
+    if args.from_frames is not None:
+        if args.field is not None or args.strands is not None:
+            raise ValueError("--from-frames cannot be combined with --field or --strands")
+        if args.capture not in (None, args.from_frames):
+            raise ValueError(
+                "--from-frames and --capture are the same capture: leave out --capture"
+            )
+        args.capture = args.from_frames
     if args.size is not None and args.camera is not None:
         raise ValueError("--size and --camera exclude each other: leave out one of them")
     if args.size is not None and not 16 <= args.size <= MOST_SIZE:
         raise ValueError(f"--size {args.size}: expected 16 to {MOST_SIZE}")
     capture = Capture(args.capture) if args.capture is not None else None
+    if capture is not None and args.from_frames is not None:
+        capture = capture.view(undistorted=True)
     if capture is None and (args.camera is not None or args.light):
         raise ValueError("--camera and --light need the rig: give --capture")
     if capture is None and args.field == "interpolation":
@@ -179,8 +190,8 @@ def _check_animation(args: argparse.Namespace, poses: int, moves: bool) -> None:
         raise ValueError("--frames needs --turntable or --turning-light")
     if not moves:
         return
-    if args.field == "interpolation":
-        raise ValueError("an animation cannot be combined with --field interpolation")
+    if args.field == "interpolation" or args.from_frames is not None:
+        raise ValueError("an animation cannot be combined with captured frames")
     turns = args.turntable or args.turning_light
     if poses and turns:
         raise ValueError("--strands cannot be combined with --turntable or --turning-light")
@@ -228,27 +239,65 @@ def _still(
 ) -> tuple[Floats, dict[str, Any]]:
     """One image, and its figures."""
     from appearance import render_mixed
-    from appearance.model.interpolated import (
-        GuidedFrames,
-        InterpolationOptions,
-        Pose,
-        all_lights,
-    )
+    from appearance.model.interpolated import InterpolationOptions, Pose, all_lights
 
     fitted, model, capture = sources
     pose = Pose(fitted, strands)
+    camera, lights, maps, _ = lit
+    scene = fitted.scene(pose.strands)
+    if capture is not None and args.from_frames is not None:
+        return _from_frames(scene, (fitted, model, capture), lit, progress)
     progress("rendering", 0.2)
-    image = render_mixed(fitted.scene(pose.strands), *lit)
+    image = render_mixed(scene, *lit)
     if capture is None or args.field != "interpolation":
         return image, {}
-    camera, lights, maps, _ = lit
-    if args.guide == "model":
-        mask = model.mask(camera.name, "hair", capture)
-        guided = GuidedFrames(fitted.scene(), fitted, capture, camera, mask)
-        return guided(image, lights), {"field": "interpolation", "guide": "model"}
     options = InterpolationOptions(guide=args.guide or "kajiya_kay")
     all_lit = camera, all_lights(lights, maps)
     return _interpolated(image, options, (pose, model, capture), all_lit, progress)
+
+
+def _from_frames(
+    scene: HairScene,
+    sources: tuple[FittedModel, Model, Capture],
+    lit: tuple[Camera, Sequence[Light], Sequence[Environment], Sampling],
+    progress: Progress,
+) -> tuple[Floats, dict[str, Any]]:
+    """The image with its hair relit from frames, and its figures."""
+    import numpy as np
+
+    from appearance import render_mixed
+    from appearance.model.from_frames import FromFrames, NewViews
+    from appearance.model.interpolated import panel
+    from appearance.render.smoothed import olat_smoothed
+
+    fitted, model, capture = sources
+    camera, lights, maps, sampling = lit
+    frames = FromFrames.of(
+        fitted,
+        model,
+        capture,
+        folder=model.file("samples"),
+        progress=lambda what, share: progress(what, 0.4 * share),
+    )
+
+    small = [part for light in lights for part in panel(light)] + frames.lights_of(maps)
+    base, view = render_mixed(scene, *lit), frames.view(camera)
+    if view is not None:
+        image, unseen = frames.relit(view, small, base)
+    else:
+        rest = [] if maps else frames.some_lights()
+        lightings, rendered = [small, *([light] for light in rest)], {}
+        for k, known in enumerate(frames.field.views):
+            progress(f"rendering {known.camera.name}", 0.4 + 0.4 * k / len(frames.field.views))
+            whole = render_mixed(scene, known.camera, lights, maps, sampling)
+            rendered[known.camera.name] = whole[None]
+            if rest:
+                single = olat_smoothed(scene, known.camera, rest, sampling)
+                rendered[known.camera.name] = np.concatenate([whole[None], single])
+        image, unseen = NewViews.of(frames, lightings, rendered)(camera, base)
+    share = f"{unseen:.0%} of the hair is captured by no camera or saturated: it is rendered"
+    warnings = [share] if unseen > 0.01 else []
+    return image, {"hair_unseen": unseen, "field": "frames", "warnings": warnings}
 
 
 def _interpolated(

@@ -11,7 +11,7 @@ from appearance.bsdf.maps import MappedStrands, scalp_coordinates
 from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.interpolation import HITS, Interpolation, irradiance
 from appearance.fields.kajiya_kay import KajiyaKay
-from appearance.fields.neighbours import camera_weights, light_weights
+from appearance.fields.neighbours import camera_weights, kriging_weights, light_weights
 from appearance.fields.reflectance import CapturedView, ReflectanceField
 from appearance.fields.search import DIFFUSE, EXPONENT, blocks, searched, worst_block
 from appearance.model.interpolated import environment_lights, panel
@@ -299,6 +299,21 @@ class TestNeighbours:
         _, weights = light_weights(both, unit(np.random.default_rng(0).normal(size=(50, 3))))
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
         assert (weights >= 0).all()
+
+    def test_kriging_by_hand_and_of_captured_and_equal_lights(self):
+        """On an arc a value at the middle is the mean; beyond the end it is the end's."""
+        a = np.radians([0.0, 20.0, 40.0])
+        arc = np.stack([np.cos(a), np.sin(a), 0 * a], -1)
+        towards = np.radians([30.0, 60.0])
+        new = np.stack([np.cos(towards), np.sin(towards), 0 * towards], -1)
+        near, weights = kriging_weights(arc, new[0])
+        np.testing.assert_allclose(weights[np.argsort(near)], [0, 0.5, 0.5], atol=1e-6)
+        near, weights = kriging_weights(arc, new[1])
+        np.testing.assert_allclose(weights[np.argsort(near)], [0, 0, 1], atol=1e-6)
+        near, weights = kriging_weights(arc, arc[1])
+        assert (near.tolist(), weights.tolist()) == ([1], [1.0])
+        twice, weights = kriging_weights(arc[[0, 0, 2]], new[0])
+        np.testing.assert_allclose(weights[np.argsort(twice)], [0.125, 0.125, 0.75], atol=1e-6)
 
     def test_one_light_alone(self):
         _, weights = light_weights(np.eye(3)[:1], unit(np.ones((1, 3))))

@@ -30,7 +30,7 @@ RESULTS = {
     },
     "images": {
         "held_out_lights": psnr(
-            ours=20.4, guided_frames=27.6, diffuse=15.3, mean_colour=12.4, three_nearest=26.1
+            ours=20.4, from_frames=27.6, diffuse=15.3, mean_colour=12.4, three_nearest=26.1
         ),
         "held_out_camera": psnr(ours=19.4, sun_fit=19.4, diffuse=14.3, mean_colour=11.4),
     },
