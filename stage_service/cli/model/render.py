@@ -265,10 +265,9 @@ def _from_frames(
     """The image with its hair relit from frames, and its figures."""
     import numpy as np
 
-    from appearance import render_mixed
     from appearance.model.from_frames import FromFrames, NewViews
     from appearance.model.interpolated import panel
-    from appearance.render.smoothed import olat_smoothed
+    from appearance.render.smoothed import environment_smoothed, olat_smoothed
 
     fitted, model, capture = sources
     camera, lights, maps, sampling = lit
@@ -281,20 +280,22 @@ def _from_frames(
     )
 
     small = [part for light in lights for part in panel(light)] + frames.lights_of(maps)
-    base, view = render_mixed(scene, *lit), frames.view(camera)
+    rest = [] if maps else frames.some_lights()
+
+    def render(camera: Camera, others: Sequence[Light]) -> Floats:
+        progress(f"rendering {camera.name}", 0.6)
+        single = olat_smoothed(scene, camera, [*lights, *others], sampling)
+        whole = single[: len(lights)].sum(axis=0)
+        for one in maps:  # the noise of paths would count as an error of the model
+            whole += environment_smoothed(scene, camera, one.shown(), sampling)
+        return np.concatenate([whole[None], single[len(lights) :]])
+
+    base, view = render(camera, [])[0], frames.view(camera)
     if view is not None:
         image, unseen = frames.relit(view, small, base)
     else:
-        rest = [] if maps else frames.some_lights()
-        lightings, rendered = [small, *([light] for light in rest)], {}
-        for k, known in enumerate(frames.field.views):
-            progress(f"rendering {known.camera.name}", 0.4 + 0.4 * k / len(frames.field.views))
-            whole = render_mixed(scene, known.camera, lights, maps, sampling)
-            rendered[known.camera.name] = whole[None]
-            if rest:
-                single = olat_smoothed(scene, known.camera, rest, sampling)
-                rendered[known.camera.name] = np.concatenate([whole[None], single])
-        image, unseen = NewViews.of(frames, lightings, rendered)(camera, base)
+        rendered = {v.camera.name: render(v.camera, rest) for v in frames.field.views}
+        image, unseen = NewViews.of(frames, [small, *([x] for x in rest)], rendered)(camera, base)
     share = f"{unseen:.0%} of the hair is captured by no camera or saturated: it is rendered"
     warnings = [share] if unseen > 0.01 else []
     return image, {"hair_unseen": unseen, "field": "frames", "warnings": warnings}
