@@ -82,13 +82,6 @@ def test_version_1_has_neither_sequences_nor_a_dead_man(serve):
     driver.close()
 
 
-def test_capabilities_are_what_the_controller_says(stage):
-    assert (stage.projectors.capabilities.dead_man, stage.projectors.capabilities.table) == (
-        True,
-        4096,
-    )
-
-
 @pytest.mark.parametrize(
     ("patterns", "entries"),
     [

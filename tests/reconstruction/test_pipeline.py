@@ -380,19 +380,6 @@ def test_no_strand_is_longer_than_the_hair(model: tuple[Path, Report]) -> None:
     assert lengths.max() > 0.19  # a ball of 10 cm has meridians of 31 cm
 
 
-def test_line_stereo_alone_is_no_longer_than_the_hair_either(
-    unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line = np.stack([np.zeros(151), np.full(151, -0.1), np.linspace(0.1, -0.2, 151)], axis=1)
-    monkeypatch.setattr(
-        "reconstruction.stages.line_strands", lambda *_, **__: ([line], Measured.none())
-    )
-    reconstruct(unswept, Model(tmp_path), method="photometric", options=QUICK)
-    strands = read_strands(tmp_path / "strands.npz")
-    assert strands.lengths() == pytest.approx([0.2], abs=1e-6)
-    assert strands.roots[0] == pytest.approx([0, -0.1, 0.1])
-
-
 def test_observed_strands_are_not_covered_by_roots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

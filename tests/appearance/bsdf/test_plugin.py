@@ -334,17 +334,3 @@ def test_path_replay_reaches_every_parameter(tuft):
         gradient = np.array(dr.grad(parameters[key]))
         assert np.isfinite(gradient).all(), key
         assert np.abs(gradient).max() > 0, key
-
-
-def test_a_uniform_volume_renders_like_a_constant(tuft):
-    scene, curves, _, _ = tuft
-    volume = mi.TensorXf(np.full((2, 2, 2, 3), 0.3, np.float32))
-    still = mi.TensorXf(np.zeros((2, 2, 2, 2), np.float32))
-    images = []
-    for bsdf in (hair(sigma_a=0.3), hair(sigma_a=volume, rotation=still, **curves)):
-        scene.hair_shape.set_bsdf(bsdf)
-        integrator = mi.load_dict({"type": "path", "max_depth": 5})
-        image = mi.render(lit_scene(scene.hair_shape), integrator=integrator, spp=8, seed=2)
-        images.append(np.array(image))
-    assert images[0].max() > 0
-    assert images[1] == pytest.approx(images[0], rel=1e-4, abs=1e-6)

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from benchmarks.renderers.cost import with_count
 from benchmarks.renderers.errors import QUICK, relative_mse, run
 from benchmarks.subjects import Subject
 
@@ -42,11 +41,3 @@ def test_a_small_run_writes_figures_and_plots(tmp_path, small):
     errors = [p["rel_mse"] for p in tuft["lights"]["3"]["series"] if p["method"] == "ours"]
     assert errors[1] < errors[0]
     assert set(result["growth"]["strands"]) == {"50", "200"}
-
-
-def test_strands_are_thinned_and_doubled_at_the_same_coverage(small):
-    tuft = small.tuft(100)
-    for count in (30, 100, 250):
-        other = with_count(tuft, count, seed=0)
-        assert len(other) == count
-        assert other.radius * count == pytest.approx(float(np.mean(tuft.radius)) * 100)

@@ -256,12 +256,6 @@ def test_overlapping_registers_are_refused(registers, lamps, message):
         ModbusLightBank(config, lamps)
 
 
-def test_as_many_lamps_as_the_default_registers_have_room_for():
-    assert ModbusLightBank(ModbusTcpConfig(), 1000).count == 1000
-    elsewhere = ModbusTcpConfig.model_validate({"registers": {"levels": 20_000}})
-    assert ModbusLightBank(elsewhere, 4000).count == 4000
-
-
 def test_dmx_levels_are_rounded_to_8_bits_and_none_vanishes(bench):
     one = bench("simulated DMX")
     one.driver.all_on()

@@ -160,13 +160,6 @@ def test_usd_that_cannot_be_read(kind: str, widths: str, words: str, tmp_path: P
         read_strands(path)
 
 
-def test_usd_without_curves(tmp_path: Path) -> None:
-    path = tmp_path / "x.usda"
-    path.write_text('#usda 1.0\ndef Xform "head" {}\n')
-    with pytest.raises(StrandFileError, match="no BasisCurves"):
-        read_strands(path)
-
-
 def test_alembic_is_whole_before_it_gets_its_name(tmp_path: Path, monkeypatch) -> None:
     """Ogawa's sixth byte is 255 in a file that is complete, 0 before."""
     pytest.importorskip("imath", reason="the extra 'alembic' is not installed")

@@ -15,6 +15,7 @@ from reconstruction import Camera, Light, Projector, Rig
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.rig import RigError
 
+RIGS = Path(__file__).resolve().parents[3] / "stage_service" / "rigs"
 number = st.floats(-1, 1)
 
 
@@ -46,15 +47,6 @@ def test_moving_the_subject_or_the_camera(
     assert same_depth == pytest.approx(depth, abs=1e-12)
     if abs(depth) > 1e-3:
         np.testing.assert_allclose(here, there, rtol=1e-7, atol=1e-6)
-
-
-def test_moving_the_subject_or_the_light() -> None:
-    Q, d = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix(), np.array([0.01, 0.02, 0.03])
-    light = Light("l", np.array([1, 2, 3]), np.ones(3), "c")
-    x = np.array([0.05, 0.1, -0.1])
-    before = np.linalg.norm(light.position - (Q @ x + d))
-    assert np.linalg.norm(light.moved(Q, d).position - x) == pytest.approx(before)
-    assert light.moved(Q, d).beside == "c"
 
 
 def test_look_at() -> None:
@@ -229,3 +221,29 @@ def test_names_must_be_distinct() -> None:
     camera = Camera.look_at("c", 8, 8, [0, -1, 0], [0, 0, 0], 30)
     with pytest.raises(RigError, match=r"cameras must have distinct names, twice: .*c"):
         Rig("r", (camera, camera), ())
+
+
+def test_a_light_whose_rows_are_right_up_forward_is_refused() -> None:
+    """Its profile would shine upside down: rows are right, down, forward, as of cameras."""
+    right, down, forward = np.eye(3)
+    Light("spot", (0, 0, 1), (1, 1, 1), orientation=np.array([right, down, forward]))
+    with pytest.raises(ValueError, match=r"spot: orientation must be a rotation .* no mirror"):
+        Light("spot", (0, 0, 1), (1, 1, 1), orientation=np.array([right, -down, forward]))
+
+
+def test_the_domes_radius_is_not_that_of_its_lamps(tmp_path: Path) -> None:
+    for name in ("demo", "stage331"):
+        rig = Rig.load(RIGS / f"{name}.toml")
+        assert {light.radius for light in rig.lights} == {0.0}
+    (tmp_path / "rig.toml").write_text(
+        "[dome]\nlights = 5\nradius = 1.2\nlight_radius = 0.02\nintensity = [1.0, 1.0, 1.0]\n"
+        '[[cameras]]\nname = "c"\nposition = [0, -1, 0]\ntarget = [0, 0, 0]\nfov_deg = 20\n'
+        "width = 8\nheight = 8\n"
+    )
+    lights = Rig.load(tmp_path / "rig.toml").lights
+    assert {light.radius for light in lights} == {0.02}
+    np.testing.assert_allclose([np.linalg.norm(x.position) for x in lights], 1.2)
+    text = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "rig.toml").write_text(text.replace("light_radius", "lamp_size"))
+    with pytest.raises(RigError, match=r"\[dome\]: unknown fields \['lamp_size'\]"):
+        Rig.load(tmp_path / "rig.toml")

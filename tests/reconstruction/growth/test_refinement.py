@@ -89,16 +89,6 @@ def test_strands_come_nearer_to_the_waves_that_lines_were_measured_on(
     np.testing.assert_allclose(made.roots, start.roots, atol=1e-7)
 
 
-def test_better_lines_give_better_strands() -> None:
-    start, requested = strands(1, 5e-4), RefineOptions(steps=4, marginal_coverage=0)
-    exact, fair, bad = (
-        errors(refine(start, lines(noise, angle), requested)[0])
-        for noise, angle in ((0.0, 0.0), (3e-4, 8.0), (8e-4, 20.0))
-    )
-    assert exact[0] < fair[0] < bad[0]
-    assert exact[1] < fair[1] < bad[1]
-
-
 def test_more_steps_do_not_follow_the_noise_of_lines_further() -> None:
     """Six strands for each measured one: most are held by no line, all are turned by some."""
     start, noisy = strands(6, 2e-4), lines(3e-4, 10.0)

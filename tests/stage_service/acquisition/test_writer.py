@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reconstruction import Camera, CaptureWriter, Rig, Step
-from stage_service.acquisition.frame_queue import FrameWriter, Shot, queued_frames
+from reconstruction import CaptureWriter, Step
+from stage_service.acquisition.frame_queue import FrameWriter, Shot
 from stage_service.config import RigFile
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
@@ -90,15 +90,6 @@ def test_a_frame_alone_is_journalled_without_waiting_for_more(folder, monkeypatc
     assert folder.counts() == (1, 0)
     writer.close()
     folder.close()
-
-
-@pytest.mark.parametrize(
-    ("cameras", "size", "frames"), [(16, (1280, 1024), 32), (8, (160, 160), 64), (2, (600, 700), 6)]
-)
-def test_so_many_frames_wait_for_the_disk(cameras, size, frames):
-    """Those of two steps, or of up to eight within 32 MiB: three of 2 x 600 x 700 x 12 bytes."""
-    views = [Camera.look_at(f"c{i}", *size, [0, -1, 0], [0, 0, 0], 20) for i in range(cameras)]
-    assert queued_frames(Rig("r", tuple(views), ())) == frames
 
 
 def test_many_frames_share_their_flushes(folder, monkeypatch):

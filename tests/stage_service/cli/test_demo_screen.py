@@ -76,10 +76,3 @@ def test_light_that_turns_is_named_if_there_is_any(tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "relit.webp").touch()
     assert "relit.webp: the hair under a turning" in last_screen(RESULTS, tmp_path)
-
-
-def test_a_quick_demo_is_labelled(tmp_path):
-    label = "quick demo: 24 lights; figures are not those of the full demo"
-    lines = last_screen({**RESULTS, "label": label}, tmp_path).splitlines()
-    assert lines[2] == label
-    assert label not in last_screen(RESULTS, tmp_path)

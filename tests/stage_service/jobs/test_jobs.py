@@ -14,7 +14,7 @@ from waiting import until
 
 from reconstruction import Model
 from stage_service.jobs.progress import JobCancelled, JobInterrupted, StepProgress, read_progress
-from stage_service.jobs.queue import JobQueue, NoSuchJob, new_job_id
+from stage_service.jobs.queue import JobQueue, new_job_id
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.jobs.slots import WorkerSlot, worker_statuses
 
@@ -52,17 +52,6 @@ def submit(queue: JobQueue, root: Path, pipeline: str = "reconstruct") -> Job:
     job = new_job_id()
     request = PipelineRequest(name=pipeline)
     return queue.submit(request, root / "capture", Model(root / job), job=job)
-
-
-def test_a_job_without_a_worker_waits_and_can_be_cancelled(queue: JobQueue, tmp_path: Path) -> None:
-    job = submit(queue, tmp_path)
-    assert (job.state, job.outcome, job.progress) == ("queued", None, None)
-    assert queue.all() == [job]
-    done = queue.cancel(job.id)
-    assert (done.state, done.outcome) == ("done", "cancelled")
-    assert queue.cancel(job.id) == done
-    with pytest.raises(NoSuchJob, match="nope"):
-        queue.get("nope")
 
 
 def test_unknown_pipelines_and_options_are_refused_by_name() -> None:

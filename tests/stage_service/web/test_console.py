@@ -16,7 +16,6 @@ from reconstruction import Model
 from simulators.frames.frames import FrameMaker
 from simulators.peers.faults import Fault
 from stage_service.acquisition.safety import Blackout
-from stage_service.acquisition.states import CaptureStatus
 
 pytestmark = pytest.mark.slow  # a browser costs some seconds of processor time a page
 RING = (0x62, 0xA8, 0xB6)
@@ -185,25 +184,6 @@ def test_a_blackout_refused_with_503_is_repeated(console):
     assert [a.action for a in http.service.audit(10)] == ["blackout"]
     assert [c for c in pages.complaints if "503" not in c] == []
     pages.complaints.clear()
-
-
-def test_a_list_of_ten_thousand_captures_is_paged(console, tmp_path):
-    http, pages = console()
-    http.post("/captures", json={"plan": {"lights": ["light_000"], "projectors": []}})
-    (one,) = until(lambda: [c for c in http.service.captures(9) if c.state == "done"])
-    status = CaptureStatus(**one.model_dump(exclude={"job"}))
-    many = http.service._captures.catalogue._found
-    for n in range(10_000):
-        name = f"20250101-{n:06d}-aaaa"
-        many[name] = status.model_copy(update={"id": name})
-    page = pages.open("frames")
-    page.wait_for_selector(f".list button >> text={one.id}")
-    assert page.locator(".list button").count() == 50
-    page.click("button:text-is('older')")
-    page.wait_for_selector(".list button >> text=20250101-009950-aaaa")
-    assert page.locator(".list button").count() == 50
-    page.click("button:text-is('newer')")
-    page.wait_for_selector(f".list button >> text={one.id}")
 
 
 def test_cameras_show_a_snapshot_and_the_stage_what_each_missed(console):
