@@ -76,7 +76,7 @@ def test_a_saturated_highlight_is_left_out_and_changes_nothing_else(plain, tufte
         radiance = np.where(bright[..., None], 1e9, o.radiance).astype(np.float32)
         views.append(replace(o, radiance=radiance, valid=~bright))
     cut = FitProblem(plain.mapped, views, plain.scale, plain.skin)
-    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64))
+    quiet = replace(ENOUGH, effort=replace(ENOUGH.effort, spp=64, pixels=160))
     assert off(check(cut, HairMaps.of(START), quiet), tufted.truth) < 0.4
 
 
