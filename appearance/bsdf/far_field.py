@@ -46,9 +46,9 @@ LEAST_BETA_M, LEAST_BETA_N = 0.15, 0.1
 class FarField:
     """`lobes.evaluate` averaged over parts of the width of a fibre that is `hair` everywhere.
 
-    The mean for rays at random offsets, with less noise. The parts of a fibre that are seen and
-    lit are not independent: direct light on the demo's hair is 5 % too bright with halves of the
-    width, 1.0 % with quarters, 0.5 % with eighths.
+    The mean for rays at random offsets, with less noise. The visible and the lit parts
+    of a fibre are not independent: direct light on the demo's hair is 5 % too bright with halves of
+    the width, 1.0 % with quarters, 0.5 % with eighths.
     """
 
     def __init__(self, hair: HairAppearance) -> None:

@@ -130,8 +130,8 @@ def render_direct(
 ) -> Floats:
     """Direct light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    With the mean BSDF of `render_indirect`: a quarter of the paths for the same noise. What is
-    seen and lit of a fibre are not independent parts of its width: 1 % too bright on the demo.
+    With the mean BSDF of `render_indirect`: half of the paths or fewer for the same noise, and
+    1 % too bright on the demo's hair (see `FarField`).
     """
     single, mix = components(lights)
     view = _View(scene, camera, single, pixel_indices(camera, pixels))

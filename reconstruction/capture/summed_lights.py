@@ -229,7 +229,7 @@ def _light_levels(sums: SummedLights, fit: CurveFit) -> tuple[Array, Array]:
     bright = top > DARK * np.median(top)
     A = (gain * lights[bright] / deviation)[:, used].T
     b = ((target - ambient) / deviation)[used]
-    near_one = 1e-6 * (np.square(A).sum() + 1)  # for lights that the places do not tell apart
+    near_one = 1e-6 * (np.square(A).sum() + 1)  # for lights that the places do not separate
     level, weight = np.ones(A.shape[1]), np.ones(len(b))
     for _ in range(5):
         H = (A * weight[:, None]).T @ A + near_one * np.eye(A.shape[1])

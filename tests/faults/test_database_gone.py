@@ -33,15 +33,15 @@ def test_a_database_that_is_gone_fills_no_log(process, simulated, serve, postgre
     postgresql.stop()
     try:
         end = time.monotonic() + GONE_S
-        answers = set()
+        statuses = set()
         while time.monotonic() < end:
-            answers.add(client.get("/jobs").status_code)
+            statuses.add(client.get("/jobs").status_code)
             time.sleep(0.2)
         lines = [log.read_text().splitlines()[n:] for log, n in zip(logs, before, strict=True)]
     finally:
         postgresql.start()
-    assert 503 in answers
-    assert answers <= {200, 503}
+    assert 503 in statuses
+    assert statuses <= {200, 503}
     for new in lines:  # two minutes have begun, for at most two causes
         assert 1 <= len(new) <= 4, new
     until(lambda: client.get("/jobs").status_code == 200)

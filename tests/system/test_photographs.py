@@ -26,7 +26,7 @@ UNIT = 0.37
 CENTER = np.array([0.4, -0.3, 0.2])
 """The subject's, metres."""
 LIGHT = np.array([0.5, -0.6, 0.7])
-SLOPE = np.radians(40)
+SLANT = np.radians(40)
 """Of the hair to the meridians; strands that are guessed run down these."""
 
 
@@ -36,20 +36,20 @@ def camera(k: int) -> Camera:
     return Camera.look_at(f"{k + 1:06d}", SIZE, SIZE, CENTER + away, CENTER, 6.6)
 
 
-def photograph(seen: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def photograph(of: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The picture `(H, W, 3)` of 8 bits, and the masks `(H, W)` of the hair and the body."""
     sub = (np.arange(3) + 0.5) / 3 - 0.5
     grid = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), axis=-1)
     offsets = np.stack(np.meshgrid(sub, sub), axis=-1).reshape(-1, 2)
-    rays = seen.rays(grid[:, :, None] + offsets)
-    eye = seen.center - CENTER
+    rays = of.rays(grid[:, :, None] + offsets)
+    eye = of.center - CENTER
     b = rays @ eye
     inside = b**2 - (eye @ eye - RADIUS**2)
     p = eye + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
     body = inside > 0
     hair = body & (p[..., 2] > -0.5 * RADIUS)
     latitude = np.arctanh(np.clip(p[..., 2] / RADIUS, -0.99, 0.99))  # Mercator's
-    across = np.arctan2(p[..., 1], p[..., 0]) - np.tan(SLOPE) * latitude
+    across = np.arctan2(p[..., 1], p[..., 0]) - np.tan(SLANT) * latitude
     albedo = 0.3 + sum(0.07 * np.cos(k * across + k) for k in (17, 29, 41))
     shade = 0.4 + 0.6 * np.maximum(p @ LIGHT / RADIUS / np.linalg.norm(LIGHT), 0)
     wall = 0.45 + 0.25 * np.sin(40 * rays[..., 0]) * np.sin(55 * rays[..., 2])
@@ -103,7 +103,7 @@ def test_photographs_become_strands_and_a_groom(
     n = points[outer] / radius[outer, None]
     north = np.array([0, 0, 1.0]) - n[:, 2:] * n
     north /= np.linalg.norm(north, axis=1, keepdims=True)
-    along = np.cos(SLOPE) * north + np.sin(SLOPE) * np.cross(north, n)
+    along = np.cos(SLANT) * north + np.sin(SLANT) * np.cross(north, n)
     cosine = np.abs((strands.tangents()[outer] * along).sum(axis=1))
     off = np.degrees(np.arccos(cosine.clip(0, 1)))
     assert np.median(off) < 12
