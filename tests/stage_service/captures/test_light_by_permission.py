@@ -723,7 +723,7 @@ def run(
 
 
 def test_no_lamp_is_lit_without_permission(monkeypatch, tmp_path, wire, world):
-    done = run(monkeypatch, tmp_path, wire, world, examples=50, steps=15, derandomize=True)
+    done = run(monkeypatch, tmp_path, wire, world, examples=60, steps=15, derandomize=True)
     assert done["steps"] >= 500
     assert done["lights"] > 0
 
