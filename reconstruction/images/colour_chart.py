@@ -29,7 +29,8 @@ EXPOSURES = (99.5, 95.0, 99.95)
 RIM_SEARCH = 0.1
 """Distance, in radii, of an outline's points from the detected circle."""
 FEWEST_RAYS, RIM_ERROR = 60, 0.6
-"""Of 180, on one circle to within so many pixels: the rim of a ball that is lit from one side."""
+"""Least number of 180 rays whose edges lie on one circle, and their error in pixels: a ball that is
+lit from one side shows part of its rim."""
 
 
 @dataclass(frozen=True, eq=False)
