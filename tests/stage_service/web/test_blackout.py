@@ -93,7 +93,7 @@ class Desk:
             response = self.http.post("/captures", json={"plan": LIT}, headers=self.lease)
             assert response.status_code == 202, response.text
             path = f"/captures/{response.json()['id']}"
-            until(lambda path=path: self.lit or self.http.get(path).json()["outcome"])
+            until(lambda path=path: self.lit or self.http.get(path).json().get("outcome"))
             if self.lit:
                 return str(response.json()["id"])
 
