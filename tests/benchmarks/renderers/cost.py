@@ -52,9 +52,11 @@ class View:
         return cls(scene, camera, hair_pixels(scene, camera, pixels, seed), seed)
 
 
-def hair_pixels(scene: HairScene, camera: Camera, count: int, seed: int) -> Ints:
-    """At most `count` pixels that hair covers more than half, in random places, sorted."""
-    covered = np.flatnonzero(coverage(scene, camera)["hair"].ravel() > 0.5)
+def hair_pixels(
+    scene: HairScene, camera: Camera, count: int, seed: int, least: float = 0.5
+) -> Ints:
+    """At most `count` pixels of which hair covers more than `least`, in random places, sorted."""
+    covered = np.flatnonzero(coverage(scene, camera)["hair"].ravel() > least)
     if not len(covered):
         raise ValueError(f"{camera.name} does not see the hair: nothing to measure")
     return np.sort(np.random.default_rng(seed).permutation(covered)[:count])

@@ -1,7 +1,7 @@
 """The simulators' frames beside many paths: error against CPU time of the ways to render them.
 
-Judged on pixels of hair under held-out lights, as the demo judges pictures. Leaves `frames.json`
-and `frames.png`.
+Judged on pixels of hair under held-out lights, as the demo judges pictures; then extreme hair and
+lights (`extremes`), as the simulators render them. Leaves `frames.json` and `frames.png`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from appearance.render.coverage import covered_pixels
 from appearance.render.smoothed import olat_smoothed
 from benchmarks.command import SUBJECT, Benchmark, option
 from benchmarks.renderers.cost import hair_pixels
+from benchmarks.renderers.extremes import Extreme, extremes
 from benchmarks.results import Panel, draw_panels, save
 from benchmarks.subjects import simulated
 from reconstruction import Camera, Light, Progress, Rig
@@ -112,7 +113,8 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """
     effort = QUICK if args.quick else Effort()
     rig = Rig.load(args.rig)
-    scene = simulated(args.rig, args.subject, args.head, args.seed).scene()
+    subject = simulated(args.rig, args.subject, args.head, args.seed)
+    scene = subject.scene()
     lights = rig.lights[effort.every_nth_light // 2 :: effort.every_nth_light]
     cameras = rig.cameras[: effort.cameras]
     pixels = [hair_pixels(scene, c, effort.pixels, 100 + k) for k, c in enumerate(cameras)]
@@ -132,7 +134,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     }
     costs = cost(scene, cameras[0], rig.lights, effort)
     for k, ((name, spp), render) in enumerate(methods(effort).items()):
-        progress(f"{name}, {spp} paths", k / len(costs))
+        progress(f"{name}, {spp} paths", k / (len(costs) + 1))
         found, means = list[float](), []
         for seed in range(args.seed, args.seed + args.seeds):
             for camera, px, true in zip(cameras, pixels, truth, strict=True):
@@ -152,7 +154,31 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         )
         save(args.out / "frames.json", result)
     draw_panels(args.out / "frames.png", [[_panel(result["series"])]])
+    progress("extremes", 1 - 1 / (len(costs) + 1))
+    result["extremes"] = {
+        e.name: _extreme(e, cameras[0], effort) for e in extremes(subject, lights)
+    }
+    save(args.out / "frames.json", result)
     return result
+
+
+def _extreme(extreme: Extreme, camera: Camera, effort: Effort) -> dict[str, float]:
+    """The error of the frames as `chosen` on one camera's picture, seed 1."""
+    scene = extreme.subject.scene()
+    pixels = hair_pixels(scene, camera, effort.pixels, 100, least=0.05)
+    one, other = _reference(scene, camera, extreme.lights, pixels, effort.reference)
+    truth = 0.5 * (one + other)
+    image = methods(effort)[SMOOTHED, effort.chosen](scene, camera, extreme.lights, pixels, 1)
+    if not truth.any():
+        return {"largest": float(image.max())}
+    exposure = Exposure.of([truth.reshape(-1, 3)])
+    own = [x + 6.02 for x in psnrs(one, other, exposure)]
+    return {
+        **_summary(psnrs(image, truth, exposure)),
+        "mean": float(image.mean() / truth.mean()),
+        "reference_db": float(np.median(own)),
+        "pixels": len(pixels),
+    }
 
 
 def _summary(values: Sequence[float]) -> dict[str, float]:
