@@ -15,16 +15,8 @@ from stage_service.acquisition.states import CaptureStatus
 from stage_service.captures.capture_queue import Entry
 from stage_service.captures.hold import Held
 from stage_service.captures.latch import Latched
-from stage_service.config import (
-    CaptureDefaults,
-    DevicesConfig,
-    DmxConfig,
-    Exposure,
-    Level,
-    RigFile,
-    Strict,
-    Text,
-)
+from stage_service.config import CaptureDefaults, Exposure, Level, RigFile, Text
+from stage_service.device_config import DevicesConfig, DmxLightsConfig, Strict
 from stage_service.jobs.records import PipelineRequest, with_example
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.person_text import LINES, ONE_LINE
@@ -341,7 +333,7 @@ class RigView(BaseModel):
 
 def _watchdog_s(devices: DevicesConfig) -> float | None:
     lights = devices.lights
-    if isinstance(lights, DmxConfig):
+    if isinstance(lights, DmxLightsConfig):
         return None
     registers = lights.registers
     return None if None in (registers.heartbeat, registers.watchdog) else devices.watchdog_s

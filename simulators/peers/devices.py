@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from simulators.frames.frames import Sensor
+from simulators.peers import dmx_node
 from simulators.peers.cameras import CameraLink
 from simulators.peers.dmx_widget import DmxWidget
 from simulators.peers.faults import Fault
@@ -21,13 +22,15 @@ from simulators.peers.modbus_unit import DisturbedUnit, ModbusUnit
 from simulators.peers.serial_peer import SerialPeer
 from simulators.peers.trigger_box import SimulatedTriggerBox
 from simulators.world import World
-from stage_service.config import (
+from stage_service.device_config import (
+    ArtNetConfig,
     DevicesConfig,
     DmxConfig,
     LightBankConfig,
     LinkCamerasConfig,
     ModbusRtuConfig,
     ModbusTcpConfig,
+    SacnConfig,
 )
 
 HOST = "127.0.0.1"
@@ -69,6 +72,8 @@ class SimulatedStage:
         light_tcp = (HOST, 0)
         if fixed and isinstance(fixed.lights, ModbusTcpConfig):
             light_tcp = (fixed.lights.host, fixed.lights.port)
+        if fixed and isinstance(fixed.lights, SacnConfig | ArtNetConfig):
+            light_tcp = (dmx_node.HOST, fixed.lights.port)
         camera_host, camera_port = HOST, 0
         if fixed and isinstance(fixed.cameras, LinkCamerasConfig):
             camera_host, camera_port = fixed.cameras.host, fixed.cameras.port
@@ -79,6 +84,8 @@ class SimulatedStage:
         light: dict[str, Any] = {"kind": light_kind.kind, "port": lights.start()}
         if isinstance(light_kind, ModbusTcpConfig):
             light["host"] = light_tcp[0]
+        if isinstance(light_kind, SacnConfig | ArtNetConfig):
+            light["host"] = dmx_node.HOST
         if isinstance(light_kind, ModbusRtuConfig):
             # a pseudo-terminal has no parity bit; a second stop bit keeps the length of characters
             light |= {"parity": "N", "stop_bits": 2}
@@ -125,9 +132,9 @@ class Wired(Protocol):
 
 def light_bank(
     config: LightBankConfig, world: Wired, link: Path, tcp: tuple[str, int], paced: bool = False
-) -> DmxWidget | ModbusRtuPeer | ModbusTcpPeer:
+) -> DmxWidget | dmx_node.DmxNode | ModbusRtuPeer | ModbusTcpPeer:
     """The peer for `config`: at `tcp` (port 0: a free one), or on a serial port at `link`, with
-    `paced` at its baud rate."""
+    `paced` at its baud rate. DMX over a network is at `dmx_node.HOST`."""
 
     def begun(fault: str) -> bool:
         return world.begun("lights", fault)
@@ -136,7 +143,10 @@ def light_bank(
         return world.strikes("lights", request)
 
     if isinstance(config, DmxConfig):
-        return DmxWidget(world.lamps, config.first_channel, link, strikes, begun)
+        first, width = config.first_channel, config.channels
+        return DmxWidget(world.lamps, first, link, strikes, begun, width)
+    if isinstance(config, SacnConfig | ArtNetConfig):
+        return dmx_node.DmxNode(world.lamps, config, tcp[1], strikes, begun)
     unit = DisturbedUnit(ModbusUnit(world.lamps, config.registers, begun), strikes, begun)
     if isinstance(config, ModbusRtuConfig):
         return ModbusRtuPeer(unit, config, link, paced)

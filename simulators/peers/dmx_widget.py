@@ -19,7 +19,8 @@ _GARBAGE = b"\x7e\x03\xff\xff\x00\x55"
 
 
 class DmxWidget(TerminalPeer):
-    """The widget at a pseudo-terminal, and `lamps` as its dimmers from `first_channel` on.
+    """The widget at a pseudo-terminal, and `lamps` as its dimmers from `first_channel` on,
+    each with `channels`.
 
     It has no watchdog: lamps keep their last level if the host stops. `strikes` gets a request's
     label, "6".
@@ -32,9 +33,10 @@ class DmxWidget(TerminalPeer):
         link: Path,
         strikes: Callable[[str], Fault | None] = lambda _request: None,
         begun: Callable[[str], bool] = lambda _fault: False,
+        channels: int = 1,
     ) -> None:
         lamps.without_dead_man()
-        self._lamps, self._before = lamps, first_channel - 1
+        self._lamps, self._before, self._width = lamps, first_channel - 1, channels
         self._strikes, self._begun = strikes, begun
         super().__init__(link)
 
@@ -74,7 +76,8 @@ class DmxWidget(TerminalPeer):
         if label == _SERIAL_NUMBER:
             return _SERIAL
         if label == _SEND_DMX and 25 <= len(data) <= 513 and data[0] == 0:
-            mine = data[1 + self._before :][: self._lamps.count].ljust(self._lamps.count, b"\0")
+            count = self._lamps.count
+            mine = data[1 + self._before :: self._width][:count].ljust(count, b"\0")
             self._lamps.show([257 * level for level in mine])
         return None
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 SERIAL = ("silent", "garbage", "nak", "late", "noise", "unplug")
 """Faults of a serial line, see `Fault`."""
-_ON_REQUEST = (*SERIAL, "crc", "echo")
+_ON_REQUEST = (*SERIAL, "crc", "echo", "drop", "repeat")
 _TRIGGER = ("interlock", "estop", "double", "dropped", "uncounted", "late_trigger")
 _KINDS = {
     "camera": ("drop", "mute", "lost", "repeat", "stray", "late_frame"),
     "trigger": (*SERIAL, *_TRIGGER),
     "projectors": (*SERIAL, "blank"),
-    "lights": (*SERIAL, "crc", "echo", "hang", "lies", "stuck"),
+    "lights": (*SERIAL, "crc", "echo", "drop", "repeat", "hang", "lies", "stuck", "override"),
 }
 
 
@@ -34,16 +34,18 @@ class Fault:
     double fires twice and counts once; dropped counts without firing; uncounted fires without
     counting; late_trigger fires `seconds` late. projectors: blank shows no pattern from then on.
     lights: hang sends no response from then on, while the watchdog runs; lies reports no lamp as
-    lit from then on; stuck keeps the lamps lit that are lit at that pulse.
+    lit from then on; stuck keeps the lamps lit that are lit at that pulse; override, on sACN and
+    Art-Net: another source sends full levels from then on.
 
     Serial faults occur once, at the first request from that pulse on that begins with `request`;
     default: any request of projectors and lights, PULSE of the trigger box. Requests of the lights
-    begin with function code and address on Modbus ("6 1000": the selector), with the label on DMX.
+    begin with function code and address on Modbus ("6 1000": the selector), with the label on DMX,
+    with "dmx" and the universe or "poll" on networks.
     silent: executed without reply. garbage: executed, invalid reply. nak: not executed, error
     reply. late: executed, reply after `seconds`. noise: executed, a line of garbage precedes the
     reply. unplug: the port disappears before execution and returns after `seconds`. Only the
     lights: crc, the reply has a wrong checksum (RTU); echo, a write is acknowledged with another
-    value.
+    value; drop, the packet is lost; repeat, the packet before it arrives once more after it.
     """
 
     device: str

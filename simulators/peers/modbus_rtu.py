@@ -7,7 +7,7 @@ from pathlib import Path
 
 from simulators.peers.modbus_unit import DisturbedUnit
 from simulators.peers.terminal import TerminalPeer
-from stage_service.config import ModbusRtuConfig
+from stage_service.device_config import ModbusRtuConfig
 
 BROADCAST = 0
 _SHORTEST, _LONGEST = 4, 256

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from simulators.peers.faults import Fault
 from simulators.peers.lamps import ENTRIES, FULL, OWNER_WORDS, Lamps, NotNow
-from stage_service.config import LightRegisters
+from stage_service.device_config import LightRegisters
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILURE = 1, 2, 3, 4
 _MOST_READ, _MOST_WRITTEN = 125, 123

@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self, TypeVar
 
 from reconstruction.geometry.rig import RigError
-from stage_service.config import (
+from stage_service.config import RigFile
+from stage_service.device_config import (
+    ArtNetConfig,
     BaslerConfig,
     DevicesConfig,
     DmxConfig,
     LightBankConfig,
-    RigFile,
+    SacnConfig,
 )
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.fan_out import FanOut
@@ -20,6 +22,7 @@ from stage_service.devices.cameras.interface import Busy, CameraDevice
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
+from stage_service.devices.lights.dmx_network import ArtNetBank, SacnBank
 from stage_service.devices.lights.interface import LightBank
 from stage_service.devices.lights.limited import LimitedLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
@@ -60,7 +63,7 @@ class DeviceSet:
         if not rig.lights:
             raise RigError(f"{rig_file.path}: no lights, but [devices.lights] has to drive some")
         try:
-            lights = _light_bank(config.lights, len(rig.lights))
+            lights = driver_for(config.lights, len(rig.lights))
         except RigError as error:
             raise RigError(f"{rig_file.path}: {error}") from error
         if isinstance(config.cameras, BaslerConfig):
@@ -178,9 +181,14 @@ class DeviceSet:
         return (self.lights, *beams, self.trigger, *self.cameras)
 
 
-def _light_bank(config: LightBankConfig, lamps: int) -> LightBank:
+def driver_for(config: LightBankConfig, lamps: int) -> LightBank:
+    """The driver of a light bank, not connected. Raises `RigError`."""
     if isinstance(config, DmxConfig):
         return DmxLightBank(config, lamps)
+    if isinstance(config, SacnConfig):
+        return SacnBank(config, lamps)
+    if isinstance(config, ArtNetConfig):
+        return ArtNetBank(config, lamps)
     return ModbusLightBank(config, lamps)
 
 

@@ -11,7 +11,7 @@ import threading
 import zlib
 from pathlib import Path
 
-from stage_service.config import LightBankConfig, ModbusTcpConfig
+from stage_service.device_config import DmxConfig, LightBankConfig, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.interface import LightBank
 from stage_service.records.lease import FileLock, LockedBy
@@ -97,14 +97,15 @@ def _in_use(bank: str, holder: str) -> StageInUse:
 
 def _place(config: LightBankConfig) -> str:
     """The bank's address as part of a file name, the same for every user of this machine."""
-    if isinstance(config, ModbusTcpConfig):
+    if isinstance(config, ModbusRtuConfig | DmxConfig):
+        place = os.path.realpath(config.port)
+    else:
         try:
             host = socket.gethostbyname(config.host)
         except OSError:
             host = config.host
-        place = f"{host}:{config.port}:{config.unit}"
-    else:
-        place = os.path.realpath(config.port)
+        unit = config.unit if isinstance(config, ModbusTcpConfig) else config.universe
+        place = f"{host}:{config.port}:{unit}"
     return re.sub(r"[^\w.:-]", "_", place)[-100:]
 
 

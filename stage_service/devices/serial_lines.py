@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import serial
 
-from stage_service.config import SerialConfig
+from stage_service.device_config import SerialConfig
 from stage_service.devices.errors import (
     DeviceError,
     DeviceTimeout,

@@ -13,7 +13,8 @@ from appearance.sun_fit.options import FitOptions
 from reconstruction import ReconstructOptions
 from reconstruction.deprecated import new_name
 from reconstruction.methods import Method
-from stage_service.config import Names, Strict, Text
+from stage_service.config import Names, Text
+from stage_service.device_config import Strict
 from stage_service.jobs.pipelines import PIPELINES
 from stage_service.plan.person_text import ONE_LINE
 

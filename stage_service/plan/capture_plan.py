@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from stage_service.config import Exposure, Level, Names, Strict, Text
+from stage_service.config import Exposure, Level, Names, Text
+from stage_service.device_config import Strict
 from stage_service.plan.person_text import LINES
 
 MOST_ROWS = 100_000

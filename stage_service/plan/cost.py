@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reconstruction import Rig, Step
-from stage_service.config import Strict
+from stage_service.device_config import Strict
 from stage_service.plan.flash import FlashRate
 
 EXR_HEADER_BYTES = 700

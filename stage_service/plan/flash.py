@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Literal
 
 from reconstruction import Step
-from stage_service.config import Strict
+from stage_service.device_config import Strict
 from stage_service.plan.timeline import Lit
 
 SLOWEST_HZ, FASTEST_HZ = 3.0, 30.0

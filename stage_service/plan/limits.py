@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from reconstruction import Rig
-from stage_service.config import PROJECTOR_LEVELS, LightBankConfig, SafetyLimits
+from stage_service.config import PROJECTOR_LEVELS, SafetyLimits
+from stage_service.device_config import LightBankConfig
 from stage_service.plan.stepping import Run
 from stage_service.plan.timeline import Lit
 

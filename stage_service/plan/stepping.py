@@ -8,7 +8,8 @@ from itertools import groupby
 from typing import Literal
 
 from reconstruction import Step
-from stage_service.config import DevicesConfig, RigFile
+from stage_service.config import RigFile
+from stage_service.device_config import DevicesConfig
 
 Stepping = Literal["software", "hardware"]
 

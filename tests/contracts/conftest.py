@@ -18,7 +18,7 @@ from simulators.peers.faults import Fault, Faults
 from simulators.peers.projector_controller import SimulatedProjectorController
 from simulators.peers.serial_peer import SerialPeer
 from simulators.peers.trigger_box import SimulatedTriggerBox
-from stage_service.config import SerialConfig
+from stage_service.device_config import SerialConfig
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from reconstruction import Camera as Geometry
-from stage_service.config import BaslerConfig
+from stage_service.device_config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.device_set import DeviceSet

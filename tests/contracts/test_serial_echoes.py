@@ -7,7 +7,7 @@ from waiting import until
 
 from simulators.peers.faults import Fault
 from simulators.peers.terminal import Adapter
-from stage_service.config import SerialConfig
+from stage_service.device_config import SerialConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout
 from stage_service.devices.projectors.interface import Pattern
 from stage_service.devices.projectors.serial_controller import SerialProjectorController

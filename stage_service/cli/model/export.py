@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
     export.add_argument(
         "--strands",
         type=int,
-        help="export so many: a random subset, or more between them; radii keep the coverage",
+        help="export a random subset, with larger radius to keep the coverage",
     )
     export.add_argument(
         "--guides", type=int, help="number of guide strands, exported separately (default: 0)"
@@ -80,9 +80,8 @@ def run(args: argparse.Namespace, output: Output) -> None:
     cyHair and PLY. Results of imported captures come in the user's world: usd, abc, hair and ply in
     the unit and axes of the cameras' files, the others in their own.
     """
-    from appearance.export.groom import Groom
+    from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
-    from appearance.export.resizing import resized
     from reconstruction import Capture, Model, parse_options, write_strands
     from reconstruction.model import FILES
 
@@ -112,7 +111,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     world = model.frame or (None if capture is None else capture.world)
     world = None if args.frame == "stage" else world
     if args.to in STRANDS:
-        strands, _ = resized(model.strands(), options.strands, options.seed)
+        strands, _ = thinned(model.strands(), options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_strands(out, strands, world)
         files = [out]

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from reconstruction import Camera
-from stage_service.config import BaslerConfig
+from stage_service.device_config import BaslerConfig
 from stage_service.devices.cameras import pixel_formats
 from stage_service.devices.cameras.genicam_nodes import Nodes
 from stage_service.devices.cameras.interface import Busy, CameraCapabilities, CameraInfo, Frame

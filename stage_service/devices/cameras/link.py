@@ -13,7 +13,7 @@ import numpy as np
 
 from reconstruction import Camera
 from reconstruction.reading import parse_json
-from stage_service.config import LinkCamerasConfig
+from stage_service.device_config import LinkCamerasConfig
 from stage_service.devices.cameras.interface import Busy, CameraCapabilities, CameraInfo, Frame
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
 

@@ -13,56 +13,45 @@ from __future__ import annotations
 import select
 import struct
 import termios
-import threading
 import time
 from collections.abc import Iterator, Sequence
 
 from reconstruction.geometry.rig import RigError
-from stage_service.config import DmxConfig
+from stage_service.device_config import DmxConfig
 from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits
-from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
+from stage_service.devices.lights.dmx import CHANNELS, FRAME_S, DmxBank
 from stage_service.devices.serial_ports import ExclusivePort
 
-CHANNELS, FEWEST_CHANNELS = 512, 24
+FEWEST_CHANNELS = 24
 GET_PARAMETERS, SEND_DMX = 3, 6
 _START, _END, _START_CODE = 0x7E, 0xE7, 0
 _MOST_USER_DATA = 32
 _MOST_QUIET = 4
 """Time-outs within which a widget with a missing reply must be silent for one time-out."""
 _STILL_LIT = "Its lamps may still be lit."
-SLOWEST_FRAME_S = 0.023
-"""A frame of 512 channels at full speed (ANSI E1.11)."""
 _PARAMETERS = struct.Struct("<HBBB")  # firmware, break, mark after break, frames a second
 
 
-class DmxLightBank:
-    """Implements `LightBank` without read-back, dead-man and table; see there for the contract.
-
-    Levels are rounded to n / 255; a level above 0 that would become 0 is an error. Raises
-    `RigError` where the lamps do not fit one universe.
-    """
-
-    capabilities = LightCapabilities(reads_back=False, dead_man=False, table=0)
+class DmxLightBank(DmxBank):
+    """The lamps of one universe; raises `RigError` where they do not fit it."""
 
     def __init__(self, config: DmxConfig, lamps: int) -> None:
-        last = config.first_channel + lamps - 1
-        if last > CHANNELS:
+        super().__init__(f"light bank (DMX, {config.port})", config, lamps)
+        if self.universes > 1:
             raise RigError(
-                f"devices.lights: {lamps} lamps from channel {config.first_channel} end at channel "
-                f"{last}; a DMX universe has {CHANNELS}"
+                f"devices.lights: {lamps} lamps of {config.channels} channels from channel "
+                f"{config.first_channel} need {self.universes} universes; a DMX universe has "
+                f"{CHANNELS} channels, and the widget has one"
             )
-        self.name = f"light bank (DMX, {config.port})"
         self.config = config
-        self.count = lamps
-        self._level = 1.0
-        self._on: range = range(0)
+        _, last = self.place(lamps - 1)
+        self._channels = max(FEWEST_CHANNELS, last + config.channels)
         self._user_bytes = 0  # bytes of user configuration in the newest request
         self._bare = False  # whether the widget replies without any
         self._late = False  # whether a reply is missing
         self._sent = b""  # since the port was last read empty
         self._port: ExclusivePort | None = None
-        self._lock = threading.RLock()
 
     def connect(self) -> None:
         """Open the port and check that a widget replies; `DeviceError` unless the rig file accepts
@@ -80,57 +69,12 @@ class DmxLightBank:
                 self._port.close()
             self._port = None
 
-    def select(self, lamp: int) -> None:
-        if not 0 <= lamp < self.count:
-            raise ValueError(f"{self.name}: lamps are 0 to {self.count - 1}, got {lamp}")
-        self._show(range(lamp, lamp + 1), self._level, f"putting lamp {lamp} on")
-
-    def all_on(self) -> None:
-        self._show(range(self.count), self._level, "putting all lamps on")
-
-    def off(self) -> None:
-        self._show(range(0), self._level, "putting all lamps off")
-
-    def set_level(self, level: float) -> None:
-        """Set the level of the lamps that are on, and of the next ones."""
-        doing = f"setting the level to {level:g}"
-        limits.level_word(self.name, doing, level, self.config.level_steps())
-        with self._lock:
-            if self._on and level != self._level:
-                self._show(self._on, level, doing)
-            self._level = level
-
-    def set_watchdog(self, seconds: float) -> None:
-        raise limits.cannot(self.name, f"setting the watchdog to {seconds:g} s", "a watchdog")
-
-    def heartbeat(self) -> None:
-        raise limits.cannot(self.name, "sending a heartbeat", "a watchdog")
-
-    def claim(self, number: int, name: str) -> str | None:
-        raise limits.cannot(self.name, "taking the stage", "an owner register")
-
-    def status(self) -> LightStatus:
-        raise limits.cannot(self.name, "reading the status", "read-back")
-
-    def load_sequence(self, entries: Sequence[tuple[Lit, float]]) -> None:
-        doing = f"loading a sequence of {len(entries)} steps"
-        raise limits.cannot(self.name, doing, "a sequence table")
-
-    def position(self) -> int:
-        raise limits.cannot(self.name, "reading the position in the sequence", "a sequence table")
-
-    def _show(self, on: range, level: float, doing: str) -> None:
-        first = self.config.first_channel - 1
-        channels = bytearray(max(FEWEST_CHANNELS, first + self.count))
-        for lamp in on:
-            channels[first + lamp] = round(level * self.config.level_steps())
-        with self._lock:
-            self._open()
-            self._send(SEND_DMX, bytes([_START_CODE]) + channels, doing)
-            rate = self._request_parameters(doing)
-            self._on = on
-            # The frame that is on the wire ends first, then ours is sent.
-            time.sleep(2 / rate if rate else 2 * SLOWEST_FRAME_S)
+    def _transmit(self, frames: Sequence[bytes], doing: str) -> None:
+        self._open()
+        self._send(SEND_DMX, bytes([_START_CODE]) + frames[0][: self._channels], doing)
+        rate = self._request_parameters(doing)
+        # The frame that is on the wire ends first, then ours is sent.
+        time.sleep(2 / rate if rate else 2 * FRAME_S)
 
     def _open(self) -> None:
         """Open the port if needed; earlier input is dropped."""

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Sequence
 
-from stage_service.config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpConfig
+from stage_service.device_config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits
 from stage_service.devices.lights import modbus_frames as frames

@@ -15,7 +15,7 @@ import termios
 import time
 from abc import ABC, abstractmethod
 
-from stage_service.config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.device_config import ModbusRtuConfig, ModbusTcpConfig
 from stage_service.devices.lights import modbus_frames as frames
 from stage_service.devices.serial_ports import ExclusivePort
 

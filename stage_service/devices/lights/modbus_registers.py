@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from reconstruction.geometry.rig import RigError
-from stage_service.config import OWNER_WORDS, LightRegisters
+from stage_service.device_config import OWNER_WORDS, LightRegisters
 
 TABLE_ENTRIES = 4096
 

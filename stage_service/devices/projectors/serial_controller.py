@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from stage_service.config import PROJECTOR_LEVELS, SerialConfig
+from stage_service.config import PROJECTOR_LEVELS
+from stage_service.device_config import SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.permission import lighting
 from stage_service.devices.projectors.interface import Pattern, ProjectorCapabilities

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import cast, get_args
 
-from stage_service.config import SerialConfig
+from stage_service.device_config import SerialConfig
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.permission import lighting
 from stage_service.devices.serial_lines import Identity, SerialLines

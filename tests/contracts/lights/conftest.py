@@ -12,21 +12,23 @@ from typing import Any
 
 import pytest
 from pyModbusTCP.server import DataHandler, ModbusServer
-from waiting import slowed
+from waiting import slowed, until
 
 from simulators.peers.devices import light_bank
+from simulators.peers.dmx_node import HOST, DmxNode
 from simulators.peers.faults import Fault, Faults
 from simulators.peers.lamps import Lamps
-from stage_service.config import (
+from stage_service.device_config import (
+    ArtNetConfig,
     DmxConfig,
     LightBankConfig,
     LightRegisters,
     ModbusRtuConfig,
     ModbusTcpConfig,
+    SacnConfig,
 )
-from stage_service.devices.lights.dmx_enttec import DmxLightBank
+from stage_service.devices.device_set import driver_for
 from stage_service.devices.lights.interface import LightBank
-from stage_service.devices.lights.modbus import ModbusLightBank
 
 LAMPS = 200
 TIMEOUT_S = 0.2
@@ -93,13 +95,6 @@ class Bench:
         return self.link is None or self.link.is_symlink()
 
 
-def driver_for(config: LightBankConfig, lamps: int) -> LightBank:
-    """A driver that is not connected."""
-    if isinstance(config, DmxConfig):
-        return DmxLightBank(config, lamps)
-    return ModbusLightBank(config, lamps)
-
-
 CONFIGS: dict[str, Callable[[str, float], LightBankConfig]] = {
     "simulated TCP": lambda _link, timeout_s: ModbusTcpConfig(port=1, timeout_s=timeout_s),
     "simulated RTU": lambda link, timeout_s: ModbusRtuConfig(
@@ -117,6 +112,18 @@ CONFIGS: dict[str, Callable[[str, float], LightBankConfig]] = {
         timeout_s=timeout_s,
         first_channel=5,
         accept_unverified_blackout=True,
+    ),
+    "simulated sACN": lambda _link, timeout_s: SacnConfig(
+        kind="sacn",
+        host=HOST,
+        timeout_s=timeout_s,
+        first_channel=500,
+        channels=3,
+        universe=7,
+        accept_unverified_blackout=True,
+    ),
+    "simulated Art-Net": lambda _link, timeout_s: ArtNetConfig(
+        kind="artnet", host=HOST, timeout_s=timeout_s, channels=4, accept_unverified_blackout=True
     ),
 }
 
@@ -168,8 +175,11 @@ def _simulated(
     one.peer, place = peer, peer.start()
     stack.callback(peer.stop)
     if isinstance(place, int):
-        assert isinstance(config, ModbusTcpConfig)
+        assert isinstance(config, ModbusTcpConfig | SacnConfig | ArtNetConfig)
         one.driver = driver_for(config.model_copy(update={"port": place}), lamps.count)
+        if isinstance(peer, DmxNode):
+            node = peer
+            one.powers = lambda: until(node.idle) and lamps.power()
     else:
         one.link = Path(place)
     return one

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 
 from reconstruction import Capture, CaptureWriter
 from stage_service.acquisition.sequencer import Sequencer
-from stage_service.config import LightBankConfig
+from stage_service.device_config import LightBankConfig
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.permission import Permission
 from stage_service.plan.capture_plan import CapturePlan
@@ -23,6 +23,8 @@ kind = "dmx_enttec"
 port = "lights"
 accept_unverified_blackout = true
 settle_s = 0.0"""
+SACN = DMX.replace("dmx_enttec", "sacn").replace('port = "lights"', "channels = 60")
+ART_NET = DMX.replace("dmx_enttec", "artnet").replace('port = "lights"', 'host = "node"')
 COILS_ALONE = """[devices.lights.registers]
 levels = "none"
 selector = "none"
@@ -37,7 +39,7 @@ baud = 38400
 accept_unverified_blackout = true"""
 
 
-@pytest.mark.parametrize("wire", [DMX, COILS_ALONE], ids=["DMX", "coils alone"])
+@pytest.mark.parametrize("wire", [DMX, SACN, ART_NET, COILS_ALONE])
 def test_a_capture_over_a_bank_without_read_back(wire, simulated, small_rig, tmp_path):
     rig = small_rig.replace("[devices.lights]", wire) + "[capture.level]\nall_on = 1.0\n"
     rig_file, world = simulated(rig=rig)

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from reconstruction.geometry.rig import RigError
-from stage_service.config import DmxConfig, ModbusTcpConfig
+from stage_service.device_config import DmxConfig, ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceUnreachable
 from stage_service.devices.lights.dmx_enttec import DmxLightBank
 from stage_service.devices.lights.modbus import ModbusLightBank
 
 WHOLE = ("simulated TCP", "simulated RTU", "simulated RTU, other registers")
 FOREIGN = ("pyModbusTCP", "the tests' own peer")
-BARE = ("simulated TCP, coils alone", "simulated DMX")
+NETWORKS = ("simulated sACN", "simulated Art-Net")
+BARE = ("simulated TCP, coils alone", "simulated DMX", *NETWORKS)
 ALL = (*WHOLE, *FOREIGN, *BARE)
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from simulators.peers.faults import Fault
 from simulators.peers.terminal import Adapter
-from stage_service.config import ModbusTcpConfig
+from stage_service.device_config import ModbusTcpConfig
 from stage_service.devices.errors import DeviceError, DeviceTimeout
 from stage_service.devices.lights.modbus import ModbusLightBank
 

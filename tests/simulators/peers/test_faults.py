@@ -37,7 +37,7 @@ def test_a_drop_shows_once_and_a_mute_stays(tmp_path):
         ({}, "expected a list"),
         ([{"device": "camera"}], "fault 1: expected device, kind, pulse"),
         ([{"device": "camera", "kind": "drop", "pulse": 1}], "camera faults"),
-        ([{"device": "lights", "kind": "drop", "pulse": 1}], "lights: .*hang"),
+        ([{"device": "lights", "kind": "mute", "pulse": 1}], "lights: .*hang"),
         ([{"device": "lights", "kind": "hang", "pulse": -1}], "pulse must be"),
         ([{"device": "camera", "kind": "drop", "pulse": 1, "camera": "x"}], "no camera 'x'"),
     ],

@@ -12,7 +12,7 @@ from simulators.peers.dmx_widget import DmxWidget
 from simulators.peers.lamps import Lamps
 from simulators.peers.modbus_rtu import ModbusRtuPeer, with_crc
 from simulators.peers.modbus_unit import DisturbedUnit, ModbusUnit
-from stage_service.config import ModbusRtuConfig
+from stage_service.device_config import ModbusRtuConfig
 
 SELECT_2 = bytes.fromhex("07 06 03e8 0002")
 SELECT_0 = bytes.fromhex("07 06 03e8 0000")

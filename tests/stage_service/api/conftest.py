@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from serving import Client, serving
 
-from stage_service.config import LightRegisters, RigFile
+from stage_service.config import RigFile
+from stage_service.device_config import LightRegisters
 
 
 @pytest.fixture

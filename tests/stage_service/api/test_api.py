@@ -22,7 +22,8 @@ from reconstruction import Model, read_exr
 from stage_service.api.app import create_app
 from stage_service.api.connections import LOOPBACK
 from stage_service.api.problems import KINDS, Problem
-from stage_service.config import LightRegisters, RigFile
+from stage_service.config import RigFile
+from stage_service.device_config import LightRegisters
 from stage_service.jobs.records import Job, PipelineRequest
 from stage_service.service import Service
 from stage_service.service_models import CaptureRequest, CaptureView, JobRequest, RigView

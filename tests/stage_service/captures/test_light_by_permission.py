@@ -43,7 +43,8 @@ from stage_service.captures import capture_queue
 from stage_service.captures.capture_queue import CaptureQueue, UnknownEntry
 from stage_service.captures.catalogue import UnknownCapture
 from stage_service.captures.control import Caller
-from stage_service.config import LightRegisters, RigFile, SafetyLimits
+from stage_service.config import RigFile, SafetyLimits
+from stage_service.device_config import LightRegisters
 from stage_service.devices.cameras import link
 from stage_service.jobs.follower import JobFollower
 from stage_service.plan.capture_plan import CapturePlan

@@ -17,7 +17,7 @@ from waiting import until
 from reconstruction import Camera as CameraGeometry
 from simulators.frames.frames import Sensor
 from stage_service.acquisition.accounting import FrameAccount
-from stage_service.config import BaslerConfig
+from stage_service.device_config import BaslerConfig
 from stage_service.devices.cameras.basler import BaslerCamera, BlockCounter
 from stage_service.devices.errors import DeviceError, DeviceUnreachable, IndexShift
 

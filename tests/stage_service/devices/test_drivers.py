@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from waiting import until
 
-from stage_service.config import DmxConfig, LinkCamerasConfig, RigFile, SerialConfig
+from stage_service.config import RigFile
+from stage_service.device_config import DmxConfig, LinkCamerasConfig, SerialConfig
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.device_set import DeviceSet

@@ -14,14 +14,8 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 from waiting import until
 
-from stage_service.config import (
-    LightBankConfig,
-    LightRegisters,
-    ModbusTcpConfig,
-    RigFile,
-    SafetyLimits,
-    load_rig_file,
-)
+from stage_service.config import RigFile, SafetyLimits, load_rig_file
+from stage_service.device_config import LightBankConfig, LightRegisters, ModbusTcpConfig
 from stage_service.devices.errors import DeviceTimeout, SafetyRefusal
 from stage_service.devices.lights.interface import LightCapabilities, LightStatus, Lit
 from stage_service.devices.lights.limited import LimitedLightBank
