@@ -1,8 +1,9 @@
 """Light banks on DMX over a network: sACN (ANSI E1.31-2018) and Art-Net 4.
 
 No library sends the packets: `sacn` repeats the last frame from a thread that outlives a failed
-main thread, and `stupidArtnet` only prints that a send failed. Neither protocol confirms a frame. Each is sent twice, one DMX frame apart, so that a lost packet has no effect, and
-repeated while the link is open: receivers would take a silent source for a lost one.
+main thread, and `stupidArtnet` only prints that a send failed. Neither protocol confirms a frame.
+Each is sent twice, one DMX frame apart, so that a lost packet has no effect, and repeated while the
+link is open: receivers would take a silent source for a lost one.
 """
 
 from __future__ import annotations
