@@ -215,8 +215,8 @@ class LinkCamerasConfig(_Cameras):
     busy_s: Seconds = 60.0
 
 
-class BaslerConfig(_Cameras):
-    """`[devices.cameras]`: Basler cameras, found by serial number.
+class GenicamConfig(_Cameras):
+    """Fields of every GenICam camera, found by serial number.
 
     `serials` maps each camera of the rig file to its number. `gain`, counts per (W/(sr m²) · s),
     and `black`, counts, are calibrated. `features` are written to the camera in their order after
@@ -224,7 +224,6 @@ class BaslerConfig(_Cameras):
     the deadline of arming; a frame may come `frame_s` after its exposure.
     """
 
-    kind: Literal["basler"]
     serials: dict[str, Annotated[str, Field(min_length=1)]]
     gain: float = Field(gt=0.0)
     black: float = Field(default=0.0, ge=0.0)
@@ -244,7 +243,21 @@ class BaslerConfig(_Cameras):
         return serials
 
 
-CamerasConfig = Annotated[LinkCamerasConfig | BaslerConfig, Field(discriminator="kind")]
+class BaslerConfig(GenicamConfig):
+    """`[devices.cameras]`: Basler cameras through pylon."""
+
+    kind: Literal["basler"]
+
+
+class AravisConfig(GenicamConfig):
+    """`[devices.cameras]`: cameras of any maker on GigE Vision or USB3 Vision, through Aravis."""
+
+    kind: Literal["aravis"]
+
+
+CamerasConfig = Annotated[
+    LinkCamerasConfig | BaslerConfig | AravisConfig, Field(discriminator="kind")
+]
 
 
 class DevicesConfig(Strict):

@@ -40,6 +40,7 @@ print(json.dumps([variant, library, drjit.has_backend(drjit.JitBackend.CUDA)]))
 """Runs in a process of its own, because a wrong library aborts it."""
 EXTRAS = {
     "basler": ("pypylon", "Basler cameras"),
+    "aravis": ("gi", "other GenICam cameras"),
     "alembic": ("alembic3d", "Alembic files"),
 }
 

@@ -9,6 +9,7 @@ from typing import Any, Self, TypeVar
 from reconstruction.geometry.rig import RigError
 from stage_service.config import RigFile
 from stage_service.device_config import (
+    AravisConfig,
     ArtNetConfig,
     BaslerConfig,
     DevicesConfig,
@@ -16,6 +17,7 @@ from stage_service.device_config import (
     LightBankConfig,
     SacnConfig,
 )
+from stage_service.devices.cameras.aravis import AravisCamera
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.cameras.interface import Busy, CameraDevice
@@ -68,6 +70,8 @@ class DeviceSet:
             raise RigError(f"{rig_file.path}: {error}") from error
         if isinstance(config.cameras, BaslerConfig):
             cameras: list[CameraDevice] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
+        elif isinstance(config.cameras, AravisConfig):
+            cameras = [AravisCamera(config.cameras, c) for c in rig.cameras]
         else:
             cameras = [LinkCamera(config.cameras, c) for c in rig.cameras]
         projectors = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 from stage_service.devices.errors import DeviceError
@@ -10,31 +11,32 @@ Value = bool | int | float | str
 TODO = "Check [devices.cameras] against the camera model's documentation."
 
 
-class Nodes:
-    """The node map `nodes` of a camera; `genicam` is pypylon's module of that name."""
+class Nodes(ABC):
+    """A camera's node map; `failures` are the exceptions of a value that the camera refuses."""
 
-    def __init__(self, device: str, nodes: Any, genicam: Any) -> None:
+    def __init__(self, device: str, failures: type[Exception]) -> None:
         self.device = device
-        self._nodes = nodes
-        self._genicam = genicam
+        self._failures = failures
 
+    @abstractmethod
     def has(self, name: str) -> bool:
         """Whether the camera has the node in its present state."""
-        return bool(self._genicam.IsAvailable(self._nodes.GetNode(name)))
 
+    @abstractmethod
     def symbols(self, name: str) -> tuple[str, ...]:
         """The values that an enumeration offers now; none where the camera lacks it."""
-        return tuple(self._nodes.GetNode(name).GetSettableValues()) if self.has(name) else ()
 
+    @abstractmethod
     def number(self, name: str) -> float | None:
         """A node's value, or None where the camera lacks it or it is not readable."""
-        node = self._nodes.GetNode(name)
-        return node.GetValue() if self._genicam.IsReadable(node) else None
 
+    @abstractmethod
     def text(self, name: str) -> str | None:
-        """As `number`, for nodes of any kind."""
-        node = self._nodes.GetNode(name)
-        return node.ToString() if self._genicam.IsReadable(node) else None
+        """As `number`, for nodes of any kind; "1" and "0" of a Boolean."""
+
+    @abstractmethod
+    def execute_if_there(self, name: str) -> None:
+        """Execute a command, where the camera has it."""
 
     def write_if_there(self, name: str, value: Value) -> None:
         """As `write`, where the camera has the node."""
@@ -43,31 +45,68 @@ class Nodes:
 
     def write(self, name: str, value: Value) -> None:
         """Set a node. Raises `DeviceError` where the camera lacks it or refuses the value."""
-        node = self._nodes.GetNode(name)
         wanted = str(int(value)) if isinstance(value, bool) else str(value)
-        if self.text(name) == wanted:
+        held = self.text(name)
+        if held == wanted:
             return  # fixed nodes, as the mode of an input-only line, are read-only
-        if not self._genicam.IsWritable(node):
-            held = self.text(name)
+        if not self._is_writable(name):
             received = "no such node" if held is None else f"{held}, which it does not let change"
             raise self._error(name, value, f"{name} = {wanted}", received)
         try:
-            node.FromString(wanted)
-        except self._genicam.GenericException as error:
-            raise self._error(name, value, self._range(node), wanted) from error
+            self._set(name, wanted)
+        except self._failures as error:
+            raise self._error(name, value, self._range(name), wanted) from error
+
+    @abstractmethod
+    def _is_writable(self, name: str) -> bool: ...
+
+    @abstractmethod
+    def _set(self, name: str, wanted: str) -> None: ...
+
+    @abstractmethod
+    def _range(self, name: str) -> str:
+        """The values that the node takes, for errors."""
+
+    def _error(self, name: str, value: Value, expected: str, received: str) -> DeviceError:
+        return DeviceError(self.device, f"setting {name} to {value}", expected, received, TODO)
+
+
+class PylonNodes(Nodes):
+    """The node map `nodes` of a camera; `genicam` is pylon's module of that name."""
+
+    def __init__(self, device: str, nodes: Any, genicam: Any) -> None:
+        super().__init__(device, genicam.GenericException)
+        self._nodes = nodes
+        self._genicam = genicam
+
+    def has(self, name: str) -> bool:
+        return bool(self._genicam.IsAvailable(self._nodes.GetNode(name)))
+
+    def symbols(self, name: str) -> tuple[str, ...]:
+        return tuple(self._nodes.GetNode(name).GetSettableValues()) if self.has(name) else ()
+
+    def number(self, name: str) -> float | None:
+        node = self._nodes.GetNode(name)
+        return node.GetValue() if self._genicam.IsReadable(node) else None
+
+    def text(self, name: str) -> str | None:
+        node = self._nodes.GetNode(name)
+        return node.ToString() if self._genicam.IsReadable(node) else None
 
     def execute_if_there(self, name: str) -> None:
-        """Execute a command, where the camera has it."""
-        node = self._nodes.GetNode(name)
-        if self._genicam.IsWritable(node):
-            node.Execute()
+        if self._is_writable(name):
+            self._nodes.GetNode(name).Execute()
 
-    def _range(self, node: Any) -> str:
+    def _is_writable(self, name: str) -> bool:
+        return bool(self._genicam.IsWritable(self._nodes.GetNode(name)))
+
+    def _set(self, name: str, wanted: str) -> None:
+        self._nodes.GetNode(name).FromString(wanted)
+
+    def _range(self, name: str) -> str:
+        node = self._nodes.GetNode(name)
         if hasattr(node, "Symbolics"):
             return "one of " + ", ".join(node.GetSettableValues())
         if hasattr(node, "GetMin"):
             return f"{node.GetMin():g} to {node.GetMax():g}"
         return "a value that the camera accepts"
-
-    def _error(self, name: str, value: Value, expected: str, received: str) -> DeviceError:
-        return DeviceError(self.device, f"setting {name} to {value}", expected, received, TODO)

@@ -18,7 +18,8 @@ from reconstruction import Camera as CameraGeometry
 from simulators.frames.frames import Sensor
 from stage_service.acquisition.accounting import FrameAccount
 from stage_service.device_config import BaslerConfig
-from stage_service.devices.cameras.basler import BaslerCamera, BlockCounter
+from stage_service.devices.cameras.basler import BaslerCamera
+from stage_service.devices.cameras.genicam import BlockCounter
 from stage_service.devices.errors import DeviceError, DeviceUnreachable, IndexShift
 
 WIDTH, HEIGHT = 32, 24
