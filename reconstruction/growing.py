@@ -21,7 +21,7 @@ from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.light_codes.line_strands import roots_first
 from reconstruction.light_planes import PointCloud
-from reconstruction.plausibility import check_face, check_strands
+from reconstruction.plausibility import check_face, check_inside, check_strands
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
@@ -179,6 +179,7 @@ class GrowingStages(Stages):
             strands = replace(strands, radius=self._radius(len(strands)))
             self._write(strands, measured, stage, scalp.area)
             check_face(strands, scalp.head, stage)
+            check_inside(strands, scalp.head, stage)
             write_root_map(self.model, strands, scalp, flat, stage)
 
     def unrooted(self, strands: Strands, measured: Measured, stage: Stage) -> None:

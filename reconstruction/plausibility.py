@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from reconstruction.arrays import Bools
 from reconstruction.capture.records import CaptureError
+from reconstruction.geometry.collisions import Collisions
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.rig import Rig
 from reconstruction.geometry.strands import Strands
@@ -140,6 +141,14 @@ def check_face(strands: Strands, head: Mesh, stage: Stage) -> None:
             f"{share:.0%} of the hair is in front of the face, between eyes and chin: if the face "
             "is bare, provide hair masks, and check the head's place (head.obj)"
         )
+
+
+def check_inside(strands: Strands, head: Mesh, stage: Stage) -> None:
+    """Record how much of the hair is inside the `head`; warn of a mesh without an inside."""
+    try:
+        stage.figures["inside_head"] = Collisions(strands, head).inside.figures()
+    except ValueError as error:
+        stage.warn(f"strands inside the head are not counted: {error}")
 
 
 def _at_all_edges(mask: Bools) -> bool:

@@ -50,17 +50,26 @@ class Groom:
 
     @classmethod
     def load(
-        cls, model: Model, capture: Capture | None = None, options: ExportOptions | None = None
+        cls,
+        model: Model,
+        capture: Capture | None = None,
+        options: ExportOptions | None = None,
+        moved: tuple[Strands, Ints] | None = None,
     ) -> Groom:
         """The groom of a model; `capture` gives the head if the model has none.
 
-        A model without a fit is brown (`FittedModel.unfitted`). Raises `ModelError` naming what is
+        `moved` are strands that replace the model's, and the index of the one that each is of. A
+        model without a fit is brown (`FittedModel.unfitted`). Raises `ModelError` naming what is
         missing.
         """
         made = FittedModel.load if model.has("appearance.json") else FittedModel.unfitted
         fitted = made(model, capture)
         measured = model.points().points if model.has("points.npz") else None
+        if moved is not None:
+            fitted = replace(fitted, strands=moved[0], placed=fitted.root_uv[moved[1]])
         groom = cls.of(fitted, options or ExportOptions(), measured)
+        if moved is not None:
+            groom = replace(groom, ids=moved[1][groom.ids])
         if fitted.head is None or not model.has("scalp_map.npz"):
             return groom
         known = model.arrays("scalp_map.npz")

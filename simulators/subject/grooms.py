@@ -84,6 +84,21 @@ GROOMS = {
         helix=1.0,
         frizz=0.0012,
     ),
+    "coils": Groom(  # type 4C
+        strands=7_500,
+        length=(0.024, 0.036),
+        step=0.00045,
+        parting_x=None,
+        gravity=3.0,
+        lift=0.030,
+        fringe=0.9,
+        clumps=2_500,
+        clumping=0.5,
+        wave_radius=0.0040,
+        wave_pitch=0.0045,
+        helix=1.0,
+        frizz=0.0020,
+    ),
 }
 
 

@@ -25,12 +25,14 @@ _APPEARANCE = {
     "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
     "straight": HairAppearance((0.30, 0.52, 0.95), 0.20, 0.28),
     "curly": HairAppearance((0.20, 0.42, 0.80), 0.34, 0.36),
+    "coils": HairAppearance((0.90, 1.40, 2.20), 0.30, 0.32),
 }
 _FILE_APPEARANCE = HairAppearance((0.10, 0.20, 0.45), 0.3, 0.3)
 _SKIN = {
     "wavy": (0.45, 0.31, 0.25),
     "straight": (0.52, 0.38, 0.31),
     "curly": (0.28, 0.18, 0.13),
+    "coils": (0.17, 0.10, 0.07),
 }
 _FILE_SKIN = (0.42, 0.30, 0.24)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stage_service.cli.support.commands import (
     BadArgument,
@@ -17,7 +17,8 @@ from stage_service.cli.support.commands import (
 if TYPE_CHECKING:
     from appearance.export.groom import Groom
     from appearance.export.options import ExportOptions
-    from reconstruction import Capture
+    from reconstruction import Capture, Mesh, Model, Strands
+    from reconstruction.arrays import Ints
     from reconstruction.geometry.world_frame import WorldFrame
 
 USD = (".usd", ".usda", ".usdc")
@@ -61,6 +62,12 @@ def add(commands: Commands) -> None:
     export.add_argument(
         "--cards", type=int, help="hair cards of gltf's finest level (default: 600)"
     )
+    export.add_argument(
+        "--collide",
+        choices=("count", "push", "cut"),
+        help="report hair inside the head; push it out, or cut it",
+    )
+    export.add_argument("--head", type=Path, help="OBJ for --collide (default: the model's head)")
     add_frame(export)
     export.add_argument("--seed", type=int, default=0)
     export.add_argument("--camera", help="a camera of the rig for mitsuba's view")
@@ -82,7 +89,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     """
     from appearance.export.groom import Groom, thinned
     from appearance.export.options import ExportOptions
-    from reconstruction import Capture, Model, parse_options, write_strands
+    from reconstruction import Capture, Model, parse_options, read_obj, write_strands
     from reconstruction.model import FILES
 
     out: Path = args.out
@@ -104,19 +111,29 @@ def run(args: argparse.Namespace, output: Output) -> None:
     for name, takers in ONLY.items():
         if getattr(args, name) is not None and args.to not in takers:
             raise BadArgument(f"--{name} is for --to {' or '.join(takers)}, not {args.to}")
+    if args.head is not None and args.collide is None:
+        raise BadArgument("--head needs --collide")
     given = {n: getattr(args, n) for n in ("strands", "guides", "cards", "seed")}
     given = {n: value for n, value in given.items() if value is not None}
     options = parse_options(ExportOptions, given, "export")
     model, capture = Model(args.model), Capture(args.capture) if args.capture else None
     world = model.frame or (None if capture is None else capture.world)
     world = None if args.frame == "stage" else world
+    moved: tuple[Strands, Ints] | None = None
+    figures: dict[str, Any] = {}
+    if args.collide is not None:
+        head = model.head(capture)
+        if args.head is not None:
+            head = read_obj(args.head) if world is None else world.inputs(read_obj(args.head))
+        moved, figures = _collided(model, head, args, output)
     if args.to in STRANDS:
-        strands, _ = thinned(model.strands(), options.strands, options.seed)
+        strands = model.strands() if moved is None else moved[0]
+        strands, _ = thinned(strands, options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_strands(out, strands, world)
         files = [out]
     else:
-        groom = Groom.load(model, capture, options)
+        groom = Groom.load(model, capture, options, moved)
         if not model.has("appearance.json"):
             output.note(
                 f"warning: {model} has no fitted material and is exported in a uniform brown: run "
@@ -130,7 +147,31 @@ def run(args: argparse.Namespace, output: Output) -> None:
     if world is not None and args.to != "maps":
         raw = args.to == "usd" or args.to in STRANDS
         output.note(f"in the frame of the cameras' files: {(world if raw else world.in_metres)}")
-    output.result({"files": [str(f) for f in files]}, "\n".join(str(f) for f in files))
+    output.result({"files": [str(f) for f in files], **figures}, "\n".join(str(f) for f in files))
+
+
+def _collided(
+    model: Model, head: Mesh | None, args: argparse.Namespace, output: Output
+) -> tuple[tuple[Strands, Ints], dict[str, Any]]:
+    """The strands after `--collide`, the index of each one's original, and figures to print."""
+    from reconstruction.geometry.collisions import Collisions
+
+    if head is None:
+        raise BadArgument(f"--collide needs a head, which {model} lacks: give --head or --capture")
+    try:
+        found = Collisions(model.strands(), head)
+    except ValueError as error:
+        raise BadArgument(f"--collide: {args.head or 'the head'}: {error}") from error
+    figures = {"inside_head": found.inside.figures()}
+    output.note(str(found.inside))
+    if edges := found.distance.open_edges:
+        output.note(f"the head has {edges} open edges: hair through openings is not inside")
+    moved = found.resolved(args.collide)
+    if args.collide != "count":
+        left = Collisions(moved[0], head).inside
+        figures["inside_head_after"] = left.figures()
+        output.note(f"after {args.collide}: {left}")
+    return moved, figures
 
 
 def _write(

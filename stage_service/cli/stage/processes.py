@@ -245,7 +245,7 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
         return 0 if code in (0, -signal.SIGINT, -signal.SIGTERM) else 1
 
 
-_GROOMS = "wavy", "straight", "curly"
+_GROOMS = "wavy", "straight", "curly", "coils"
 SUBJECTS = (*_GROOMS, *(f"{name}-mixed" for name in _GROOMS))
 """The simulators' subjects; a mixed one has the strands of its groom in several colours."""
 

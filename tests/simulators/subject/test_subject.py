@@ -90,6 +90,31 @@ def test_styles_differ_in_how_much_they_turn(subjects):
     assert turn["straight"] < 0.6 * turn["wavy"] < 0.5 * turn["curly"]
 
 
+def test_tight_coils_have_the_radius_and_pitch_of_type_4c():
+    strands = make_subject("coils", 3, strands=1500).strands
+    assert skin_distance(strands.points.astype(float)).min() > -1e-3
+    radii, pitches = [], []
+    for i in range(0, len(strands), 10):
+        half = strands[i][len(strands[i]) // 2 :].astype(float)
+        curvature, torsion = curvature_and_torsion(half)
+        squared = curvature**2 + torsion**2  # of a helix of radius r and pitch 2πc
+        radii.append(np.median(curvature / squared))
+        pitches.append(2 * np.pi * np.median(np.abs(torsion) / squared))
+    assert 2e-3 < np.median(radii) < 4e-3
+    assert 3e-3 < np.median(pitches) < 6e-3
+
+
+def curvature_and_torsion(line):
+    d1 = np.gradient(line, axis=0)
+    d2 = np.gradient(d1, axis=0)
+    d3 = np.gradient(d2, axis=0)
+    cross = np.cross(d1, d2)
+    area = np.linalg.norm(cross, axis=1)
+    speed = np.linalg.norm(d1, axis=1)
+    kept = slice(4, -4)
+    return (area / speed**3)[kept], ((cross * d3).sum(axis=1) / area**2)[kept]
+
+
 @pytest.mark.parametrize(
     "name", [NAMES[0], *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES[1:])]
 )

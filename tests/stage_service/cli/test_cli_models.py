@@ -24,12 +24,14 @@ from reconstruction import (
     Capture,
     CaptureWriter,
     Light,
+    Mesh,
     Model,
     Rig,
     Step,
     Strands,
     read_exr,
     read_strands,
+    write_obj,
     write_strands,
 )
 from reconstruction.geometry.lights import dome_positions
@@ -420,3 +422,39 @@ def test_a_model_is_not_made_among_others_files(made, capsys, tmp_path, monkeypa
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
     monkeypatch.setattr(steps, "reconstruct", lambda _: {})
     assert run(capsys, "reconstruct", made.capture, "--out", model)[0] == 0  # once more
+
+
+def test_hair_inside_a_head_is_counted_pushed_out_or_cut(made, capsys, tmp_path):
+    """The tuft's strands rise from z = -0.03 to 0.03 through a box that is 2 cm high."""
+    box = Mesh(*box_of((-0.05, -0.05, -0.01), (0.05, 0.05, 0.01)))
+    write_obj(tmp_path / "box.obj", box)
+    words = ("export", made.model, "--to", "hair", "--head", tmp_path / "box.obj")
+    code, found = run(capsys, *words, "--out", tmp_path / "n.hair", "--collide", "count")
+    assert code == 0
+    assert found["inside_head"]["strands"] == 200
+    assert found["inside_head"]["metres"] == pytest.approx(200 * 0.02, rel=0.02)
+    assert found["inside_head"]["deepest_mm"] == pytest.approx(10, abs=0.1)
+    code, found = run(capsys, *words, "--out", tmp_path / "c.hair", "--collide", "cut")
+    assert (code, found["inside_head_after"]["strands"]) == (0, 0)
+    cut = read_strands(tmp_path / "c.hair")
+    assert len(cut) == 400
+    assert cut.lengths().sum() == pytest.approx(200 * 0.04, rel=0.02)
+    usd = ("export", made.model, "--to", "usd", "--head", tmp_path / "box.obj")
+    code, found = run(capsys, *usd, "--out", tmp_path / "c.usdc", "--collide", "cut")
+    assert code == 0
+    assert len(read_strands(tmp_path / "c.usdc")) == 400
+    code, found = run(capsys, *words, "--out", tmp_path / "n.hair")
+    assert code != 0
+    assert "--head needs --collide" in found["error"]["detail"]
+    none = ("export", made.model, "--to", "hair", "--out", tmp_path / "n.hair")
+    code, found = run(capsys, *none, "--collide", "push")
+    assert code != 0
+    assert "needs a head" in found["error"]["detail"]
+
+
+def box_of(low, high):
+    """Vertices and outward faces of a box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return np.where(corners, high, low), np.array(faces)
