@@ -44,7 +44,7 @@ FILES = {
     "masks": "masks of hair and skin of every camera, in the pixels of its frames",
     "appearance.json": "the hair as one material, skin, exposure (Sun's fit)",
     "hair_maps.npz": "the hair's material over the scalp (inverse rendering)",
-    "lights.json": "light intensities fitted by inverse rendering",
+    "lights.json": "light intensities, axes and lobes fitted by inverse rendering",
     "field.npz": "modulation or additive field on top of the material",
     "samples": "captured frames by camera, for interpolation",
     "comparison.png": "held-out frames, captured and rendered",

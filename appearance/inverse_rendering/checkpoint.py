@@ -16,13 +16,14 @@ from reconstruction.files.durable import writing
 
 @dataclass
 class State:
-    """The state of a fit after the stages of `decisions`: `raw`, and factors on the intensities
-    `gain (L,)`; `left_open` is that of `Outcome`."""
+    """The state of a fit after the stages of `decisions`: `raw`, factors on the intensities
+    `gain (L,)`, and `lobes (L, 6)`, if any; `left_open` is that of `Outcome`."""
 
     raw: Raw
     gain: Array
     decisions: list[Decision] = field(default_factory=list)
     left_open: dict[str, float] = field(default_factory=dict)
+    lobes: Array | None = None
 
     def save(self, path: Path | None, fingerprint: str) -> None:
         """Write the state, whole or not at all; nothing where `path` is None."""
@@ -34,6 +35,8 @@ class State:
             "left_open": self.left_open,
         }
         arrays = {f"raw/{name}": value for name, value in self.raw.items()} | {"gain": self.gain}
+        if self.lobes is not None:
+            arrays["lobes"] = self.lobes
         with writing(path) as part:
             np.savez(part, numbers=np.array(json.dumps(numbers)), **arrays)  # type: ignore[arg-type]
 
@@ -48,4 +51,5 @@ class State:
                 return None
             raw = {k.removeprefix("raw/"): data[k] for k in data.files if k.startswith("raw/")}
             decisions = [Decision(**x) for x in numbers["decisions"]]
-            return cls(raw, data["gain"], decisions, numbers["left_open"])
+            lobes = data["lobes"] if "lobes" in data.files else None
+            return cls(raw, data["gain"], decisions, numbers["left_open"], lobes)

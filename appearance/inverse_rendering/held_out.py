@@ -41,3 +41,19 @@ class Split:
         fitted, held_out = np.ix_(views, lights), lit.copy()
         held_out[fitted] = False
         return cls(problem, problem.part(views, lights), lights, lit[fitted], held_out)
+
+    @property
+    def left_out(self) -> Bools:
+        """Of `fitted`, the frames `(V', L')` that the lights' lobes are not fitted to: none if a
+        view is held out, else of each light those of one view."""
+        views, lights = self.fitted.shape
+        of = np.arange(views)[:, None] == np.arange(lights) % max(views, 1)
+        return np.asarray(of & (len(self.problem.views) < FEWEST_VIEWS) & self.fitted)
+
+    def frames_of_fitted(self) -> Bools:
+        """The frames `(V, L)` of fitted lights that their lobes are not fitted to."""
+        out = np.zeros_like(self.held_out)
+        out[:, self.lights] = self.held_out[:, self.lights]
+        if len(self.problem.views) < FEWEST_VIEWS:
+            out[:, self.lights] |= self.left_out
+        return out

@@ -13,21 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appearance.bsdf.maps import HairMaps
+from appearance.inverse_rendering.batches import Batch, lit_pairs
 from appearance.inverse_rendering.checkpoint import State
 from appearance.inverse_rendering.correctives import solve_correctives
 from appearance.inverse_rendering.global_parameters import Evidence, solve_global_parameters
 from appearance.inverse_rendering.held_out import Split
 from appearance.inverse_rendering.initial_absorption import absorption_of_cells
+from appearance.inverse_rendering.lobes import (
+    as_calibrated,
+    determined,
+    solve_lobes,
+    with_lobes,
+    without_axis,
+)
 from appearance.inverse_rendering.options import InverseRenderingOptions
 from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import Raw, decode, encode
 from appearance.metrics.decision import MATERIAL, Decision, Material, decide
 from reconstruction import Progress, silent
-from reconstruction.arrays import Array
+from reconstruction.arrays import Array, Bools
 from reconstruction.geometry.lights import LightPattern
 
 SHARED_VIEWS, SHARED_LIGHTS = 3, 8
 """Views, and lights of each, for the global parameters."""
+LOBE_ROUNDS = 2
+"""Times that the lights' lobes are solved for, and the hair under them."""
 HELD_LIGHTS = 4
 """Lights that are held out, at most."""
 LEAST_PIXELS = 1.0
@@ -43,13 +53,15 @@ class Outcome:
     """The result of a fit.
 
     `gain (L,)` are factors on the lights' intensities; `decisions` has one for each stage.
-    `left_open`: see `global_parameters.Solved`.
+    `left_open`: see `global_parameters.Solved`. `lobes (L, 6)`: see `lobes.as_calibrated`, None
+    where no axis was looked for.
     """
 
     maps: HairMaps
     gain: Array
     decisions: list[Decision] = field(default_factory=list)
     left_open: dict[str, float] = field(default_factory=dict)
+    lobes: Array | None = None
 
     @property
     def kept(self) -> list[str]:
@@ -118,7 +130,8 @@ class _Fit:
             self._add(stages[k], state, progress)
             state.save(monitor.checkpoint, fingerprint)
             monitor.progress(str(state.decisions[-1]), (k + 1) / count)
-        return Outcome(decode(state.raw), state.gain, state.decisions, state.left_open)
+        found = state.left_open, state.lobes
+        return Outcome(decode(state.raw), state.gain, state.decisions, *found)
 
     def _add(self, stage: Material, state: State, progress: Progress) -> None:
         if reason := self._skipped(stage, state):
@@ -126,17 +139,27 @@ class _Fit:
             return
         begun = time.perf_counter()
         progress("fitting", 0.0)
-        raw, gain, left_open = self._solvers[stage](state.raw, state.gain, progress)
+        raw, gain, left_open, *lobes = self._solvers[stage](state.raw, state.gain, progress)
         progress("rendering held-out frames", 0.9)
         seed = (self.seed << 16) + ((1 + len(state.decisions)) << 24)
+        held_out, lit_by = self.split.held_out, []
+        state.lobes = lobes[0] if lobes else state.lobes
+        if lobes and np.isfinite(lobes[0][:, 3]).any():
+            held_out, given = self.split.frames_of_fitted(), self.problem.lights
+            lit_by = [given, with_lobes(given, lobes[0])]
+        guesses = [(state.raw, state.gain), (raw, gain)]
         (before, after), counts = self.problem.squares(
-            [(state.raw, state.gain), (raw, gain)], self.split.held_out, self.options.effort, seed
+            guesses, held_out, self.options.effort, seed, lit_by
         )
         decision = decide(stage, before, after, counts, time.perf_counter() - begun)
         state.decisions.append(decision)
         if decision.kept:
             state.raw, state.gain = raw, gain
             state.left_open = left_open or state.left_open
+            if lit_by:
+                self._add_lobes_of_held_out(state)
+        elif state.lobes is not None:
+            state.lobes[:, :4] = np.nan
 
     def _skipped(self, stage: Material, state: State) -> str:
         """Why a stage cannot pay for its cost; empty if it may."""
@@ -171,13 +194,22 @@ class _Fit:
         }
 
     def _shared(
-        self, raw: Raw, gain: Array, progress: Progress, names: Sequence[str] = ()
+        self,
+        raw: Raw,
+        gain: Array,
+        progress: Progress,
+        names: Sequence[str] = (),
+        lobes: Array | None = None,
     ) -> _Solved:
-        """`names`, by default roughness and colour, solved for."""
-        pairs = self.training.spread(self.split.fitted, SHARED_VIEWS, SHARED_LIGHTS)
+        """`names`, by default roughness and colour, solved for; of fitted lights with `lobes`."""
+        training, fitted = self.training, self.split.fitted
+        if lobes is not None:
+            training = training.under(with_lobes(training.lights, lobes))
+            fitted = fitted & ~self.split.left_out
+        pairs = training.spread(fitted, SHARED_VIEWS, SHARED_LIGHTS)
         evidence = Evidence(pairs, self.options.effort, self.seed << 4)
         raw, of_lights, left_open = solve_global_parameters(
-            self.training, raw, gain[self.lights], names or self.colour, evidence, progress
+            training, raw, gain[self.lights], names or self.colour, evidence, progress
         )
         gain = gain.copy()
         gain[self.lights] = of_lights
@@ -200,8 +232,36 @@ class _Fit:
         found = solve_correctives(self.training, raw, gain[self.lights], effort, seed=seed)
         return found.raw, gain, {}
 
-    def _lights(self, raw: Raw, gain: Array, progress: Progress) -> _Solved:
-        return self._shared(raw, gain, progress, [*self.colour, "gain"])
+    def _lights(self, raw: Raw, gain: Array, progress: Progress) -> Any:
+        names = [*self.colour, "gain"]
+        if not any(map(without_axis, self.training.lights)):
+            return self._shared(raw, gain, progress, names)
+        pairs = _pairs(self.split.fitted & ~self.split.left_out)
+        lobes, start = as_calibrated(len(gain)), gain
+        left_open: dict[str, float] = {}
+        for k in range(LOBE_ROUNDS):
+            seed = (self.seed << 4) + k
+            found, factors = solve_lobes(self.training, raw, pairs, self.options.effort, seed)
+            gain = start.copy()
+            gain[self.lights] *= factors
+            raw, gain, left_open = self._shared(raw, gain, progress, names, found)
+            lobes[self.lights] = found
+            if not np.isfinite(found[:, 3]).any():
+                break
+        lobes, gain = determined(self.problem, lobes, gain)
+        return raw, gain, left_open, lobes
+
+    def _add_lobes_of_held_out(self, state: State) -> None:
+        """Those of the lights that were held out, on the hair that was kept."""
+        assert state.lobes is not None
+        rest = np.delete(np.arange(len(self.problem.lights)), self.lights)
+        lit = lit_pairs(self.problem.views, self.problem.scale)
+        lit[:, self.lights] = False
+        effort, seed = self.options.effort, (self.seed << 4) + 7
+        found = solve_lobes(self.problem, state.raw, _pairs(lit), effort, seed)
+        lobes, factors = determined(self.problem, *found)
+        state.lobes[rest], state.gain = lobes[rest], state.gain.copy()
+        state.gain[rest] *= factors[rest]
 
     def _in_cells(self, raw: Raw) -> Raw:
         return encode(decode(raw).resized(self.options.shape))
@@ -216,6 +276,12 @@ class _Fit:
         return total.hexdigest()
 
 
+def _pairs(used: Bools) -> list[Batch]:
+    """The pairs `used (V, L)`, by view."""
+    return [Batch(v, np.flatnonzero(row)) for v, row in enumerate(used) if row.any()]
+
+
 _Solved = tuple[Raw, Array, dict[str, float]]
-_Solver = Callable[[Raw, Array, Progress], _Solved]
-"""Solves a stage: fitted unknowns, factors on the lights' intensities, and `Solved.left_open`."""
+_Solver = Callable[[Raw, Array, Progress], Any]
+"""Solves a stage: fitted unknowns, factors on the lights' intensities, `Solved.left_open`, and
+lobes if they were looked for."""

@@ -92,17 +92,21 @@ def fit_maps(
         if found.kept:
             found.maps.save(model, mapped.root_uv)
             if singles := [x for x in problem.lights if isinstance(x, Light)]:
-                save_lights(model, found.gain, singles)
+                save_lights(model, found.gain, singles, found.lobes)
             stage.warnings += _doubts(start, found.maps, bool(training.olat_lights())) + _flat(
                 found.left_open
             )
-        result = {
+        result: dict[str, Any] = {
             "stages": [x.to_dict() for x in found.decisions],
             "kept": found.kept,
             "rendered": "inverse_rendering" if found.kept else "sun_fit",
             "left_open": found.left_open,
             "lights": len(problem.lights) - held,
         }
+        if found.lobes is not None:
+            axes = _axes([x.name for x in problem.lights], found.lobes)
+            result["axes"] = axes
+            stage.warnings += _undetermined(axes)
         stage.figures |= {**result, "options": asdict(options), "depth": depth}
     report.drop("field")
     model.write_report(report)
@@ -142,6 +146,31 @@ def _flat(left_open: Mapping[str, float]) -> list[str]:
         "stays near its start"
         for name, open_ in left_open.items()
         if open_ > FLAT
+    ]
+
+
+def _axes(names: Sequence[str], lobes: Array) -> dict[str, dict[str, float | None]]:
+    """Axis' standard error in degrees, power and its error, of lights whose axis was fitted; the
+    power is None where the axis is undetermined."""
+    return {
+        name: {
+            "axis_error_deg": float(np.degrees(row[4])),
+            "power": float(row[3]) if np.isfinite(row[3]) else None,
+            "power_error": float(row[5]),
+        }
+        for name, row in zip(names, lobes, strict=True)
+        if np.isfinite(row[4])
+    }
+
+
+def _undetermined(axes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
+    """A sentence on lights without an axis beside lights with one."""
+    lost = [f"{n} ({x['axis_error_deg']:.0f}°)" for n, x in axes.items() if x["power"] is None]
+    if not lost or len(lost) == len(axes):
+        return []
+    return [
+        f"The axes of {len(lost)} of {len(axes)} lights are undetermined (standard errors: "
+        f"{', '.join(lost)}). They stay as calibrated; give their aim in the rig file"
     ]
 
 

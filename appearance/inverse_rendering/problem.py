@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from appearance.inverse_rendering.unknowns import Raw, decode
 from appearance.observations import Observed
 from appearance.render.cached_paths import CachedPaths, CachedSampling, WeightedPixels, cache_paths
 from appearance.render.olat import render_indirect, render_olat
-from appearance.scene.hair_scene import HairScene, light_arrays
+from appearance.scene.hair_scene import SCALE, HairScene, light_arrays
+from appearance.sun_fit.visible_fibres import visible_fibres
 from reconstruction import Camera
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.geometry.lights import Lighting, components
@@ -84,13 +86,39 @@ class FitProblem:
         out._scenes = self._scenes
         return out
 
+    def under(self, lights: Sequence[Lighting]) -> FitProblem:
+        """The same under other `lights` (L), at the same places; the scene is shared."""
+        views = [replace(o, lights=tuple(lights)) for o in self.views]
+        out = FitProblem(self.mapped, views, self.scale, self.skin)
+        out._scenes = self._scenes
+        return out
+
+    @cached_property
+    def centre(self) -> Array:
+        """The middle `(3,)` of what is rendered, in metres."""
+        return np.array(self.mapped.scene.mi_scene.bbox().center()).ravel() / SCALE
+
+    def points(self, patch: Patch) -> Array:
+        """The mean hit `(P, 3)` of each pixel of a patch, in metres; `centre` without one."""
+        o = self.views[patch.view]
+        fibres = visible_fibres(self.mapped.scene, o.camera, o.pixels[patch.few])
+        count = fibres.hair.sum(axis=1)[:, None]
+        mean = fibres.point.sum(axis=1, dtype=float) / np.maximum(count, 1)
+        return np.where(count > 0, mean, self.centre)
+
     def squares(
-        self, guesses: Sequence[tuple[Raw, Array]], used: Bools, effort: Effort, seed: int
+        self,
+        guesses: Sequence[tuple[Raw, Array]],
+        used: Bools,
+        effort: Effort,
+        seed: int,
+        lit_by: Sequence[Sequence[Lighting]] = (),
     ) -> tuple[Array, Array]:
         """Sums of weighted squared errors of each guess `(G, V, B)`, and their counts `(V, B)`.
 
         Of all hair pixels of the V views of the pairs `used (V', L)`, without noise, under the same
-        weights for all guesses. The B parts are a view's pixels, with own paths, in image order.
+        weights for all guesses; `lit_by` are the lights of each guess, where they differ. The B
+        parts are a view's pixels, with own paths, in image order.
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
         paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
@@ -98,13 +126,14 @@ class FitProblem:
             "spp": int(np.clip(paths, _LEAST_PATHS, 8 * effort.spp)),
             "max_depth": effort.max_depth,
         }
+        problems = [self.under(x) for x in lit_by] or [self] * len(guesses)
         sums, counts = [], []
         for k in views:
             o, lights = self.views[k], np.flatnonzero(used[k])
             patch = Patch(k, lights, np.arange(len(o.pixels)))
             halves = np.zeros((len(guesses), 2, len(lights), len(o.pixels), 3))
             for g, (raw, gain) in enumerate(guesses):
-                scene, camera, packed, pixels = self._setup(raw, gain, patch)
+                scene, camera, packed, pixels = problems[g]._setup(raw, gain, patch)
                 for h in (0, 1):
                     first = seed + k + (h << 20)
                     halves[g, h] = render_olat(
@@ -129,11 +158,13 @@ class FitProblem:
         level = 0.5 * (level + losses.level(rendered))
         return Comparison(rendered, captured, level, o.valid[patch.lights][:, patch.few])
 
-    def render(self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int) -> Array:
-        """A patch under `gain (L,)` in exposure units `(k, P, 3)`."""
+    def render(
+        self, raw: Raw, gain: Array, patch: Patch, effort: Effort, seed: int, thrift: float = 0
+    ) -> Array:
+        """A patch under `gain (L,)` in exposure units `(k, P, 3)`; see `OlatOptions.thrift`."""
         scene, camera, lights, pixels = self._setup(raw, gain, patch)
-        spent: dict[str, int] = {"spp": effort.spp, "max_depth": effort.max_depth, "thrift": 0}
-        radiance = render_olat(scene, camera, lights, seed=seed, pixels=pixels, **spent)
+        options = {"spp": effort.spp, "max_depth": effort.max_depth, "thrift": thrift}
+        radiance = render_olat(scene, camera, lights, seed=seed, pixels=pixels, **options)
         return radiance.astype(float) * self.scale
 
     def render_all(self, raw: Raw, gain: Array, view: int, effort: Effort, seed: int) -> Array:

@@ -12,7 +12,7 @@ from reconstruction.arrays import AnyFloats, Array
 
 Material = Literal["shared", "spatial", "correctives", "lights"]
 """Stages of inverse rendering: roughness and colour of all hair, maps over the scalp and along
-strands, rotations of the fibres, intensities of the lights."""
+strands, rotations of the fibres, intensities, axes and lobes of the lights."""
 FitStage = Literal["sun", "shared", "spatial", "correctives", "lights", "field"]
 MATERIAL: tuple[Material, ...] = get_args(Material)
 STAGES: tuple[FitStage, ...] = get_args(FitStage)

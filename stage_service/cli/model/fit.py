@@ -69,9 +69,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
     Stages in order: sun (roughness and colour from highlights, MODEL/appearance.json), shared
     (both by rendering), spatial (colour over the scalp and along strands), correctives (rotations
-    of the fibres), lights (their intensities; MODEL/hair_maps.npz and lights.json), and field (the
-    reflectance that the material lacks; MODEL/field.npz). Each after the first is kept if it lowers
-    the error on frames that took no part by more than its standard error. --stages without sun uses
+    of the fibres), lights (their intensities, axes and lobes; MODEL/hair_maps.npz and lights.json),
+    and field (the reflectance that the material lacks; MODEL/field.npz). Each after the first is
+    kept if it lowers the error on frames that took no part by more than its standard error. --stages without sun uses
     an existing sun fit that held out the same. Held-out cameras and lights score the model.
     """
     from appearance.render.environment_maps import environment_map

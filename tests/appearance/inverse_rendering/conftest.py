@@ -33,9 +33,9 @@ def cameras(count: int) -> list[Camera]:
     return [Camera.look_at(f"c{i}", 20, 20, p, (0, 0, 0.0), 12) for i, p in enumerate(places)]
 
 
-def observed(scene, camera, lights, spp=128):
+def observed(scene, camera, lights, spp=128, depth=DEPTH):
     pixels = np.flatnonzero((coverage(scene, camera)["hair"] > 0.5).ravel())
-    radiance = render_olat(scene, camera, lights, spp=spp, max_depth=DEPTH, pixels=pixels, seed=99)
+    radiance = render_olat(scene, camera, lights, spp=spp, max_depth=depth, pixels=pixels, seed=99)
     return Observed(camera, lights, pixels, radiance, np.ones(radiance.shape[:2], bool))
 
 
@@ -69,6 +69,17 @@ def tufted(small):
         truth=TRUTH,
         dome=dome,
     )
+
+
+@pytest.fixture(scope="session")
+def observing():
+    """`observing(mapped, shown, cameras, lights, spp=…, depth=…)`: a problem of hair `shown`."""
+
+    def problem(mapped, shown, around, lights, **how):
+        views = [observed(shown, c, tuple(lights), **how) for c in around]
+        return FitProblem(mapped, views, exposure(views), SKIN)
+
+    return problem
 
 
 @pytest.fixture(scope="session")
