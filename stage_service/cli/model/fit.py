@@ -71,8 +71,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     (both by rendering), spatial (colour over the scalp and along strands), correctives (rotations
     of the fibres), lights (their intensities, axes and lobes; MODEL/hair_maps.npz and lights.json),
     and field (the reflectance that the material lacks; MODEL/field.npz). Each after the first is
-    kept if it lowers the error on frames that took no part by more than its standard error. --stages without sun uses
-    an existing sun fit that held out the same. Held-out cameras and lights score the model.
+    kept if it lowers the error on frames that took no part by more than its standard error.
+    --stages without sun uses an existing sun fit that held out the same. Held-out cameras and
+    lights score the model.
     """
     from appearance.render.environment_maps import environment_map
     from reconstruction import Capture, Model, parse_options
