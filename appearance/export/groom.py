@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from appearance.bsdf.longitudinal import colour_of_absorption
 from appearance.bsdf.maps import HairMaps
 from appearance.export.options import ExportOptions
+from appearance.export.resizing import resized
 from appearance.model.fitted_model import FittedModel
 from reconstruction import Capture, Mesh, Model, Strands
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
@@ -82,7 +83,7 @@ class Groom:
         cls, fitted: FittedModel, options: ExportOptions, measured: AnyFloats | None = None
     ) -> Groom:
         """The groom of a fit; `measured (M, 3)` are triangulated points."""
-        strands, ids = thinned(fitted.strands, options.strands, options.seed)
+        strands, ids = resized(fitted.strands, options.strands, options.seed)
         confidence = strands.confidence
         if confidence is None and measured is not None and len(measured):
             far = 5 * MEASURED
@@ -132,23 +133,6 @@ class Groom:
 def upwards(uv: Array) -> Floats:
     """`uv (N, 2)` of images whose rows go down, with v that goes up."""
     return (uv * (1, -1) + (0, 1)).astype(np.float32)
-
-
-def thinned(strands: Strands, count: int | None, seed: int) -> tuple[Strands, Ints]:
-    """`count` of the strands, drawn at random, and their indices `(count,)`, in order.
-
-    The radius is multiplied by the ratio of total lengths, which keeps the covered area.
-    """
-    if count is None or count >= len(strands):
-        return strands, np.arange(len(strands))
-    drawn = np.random.default_rng(seed).choice(len(strands), count, replace=False)
-    ids = np.sort(drawn)
-    few = strands.subset(ids)
-    # of radii that vary the area counts, length by length
-    left = _area(few)
-    if not left:  # strands without length: no radius makes up for the others
-        return few, ids
-    return replace(few, radius=few.radius * (_area(strands) / left)), ids
 
 
 def clumps(strands: Strands, count: int, seed: int) -> tuple[Ints, Ints]:
@@ -205,11 +189,3 @@ def at_points(maps: HairMaps, strands: Strands, root_uv: Array) -> tuple[Array, 
         high = np.minimum(low + 1, layers - 1)
         out.append(table[low, u, v] * (1 - share) + table[high, u, v] * share)
     return out[0], out[1]
-
-
-def _area(strands: Strands) -> float:
-    starts = strands.segment_starts
-    points = strands.points.astype(float)
-    length = np.linalg.norm(points[starts + 1] - points[starts], axis=1)
-    radius = np.broadcast_to(np.asarray(strands.radius, float), len(points))
-    return float(length @ radius[starts])

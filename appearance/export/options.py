@@ -13,7 +13,8 @@ from reconstruction.options import Count, options
 class ExportOptions:
     """Options of an export.
 
-    `strands`: number of random strands, with radii that keep the covered area; all if None.
+    `strands`: their number, of a random subset or with more strands between those of the model,
+    with radii that keep the covered area; all of the model's if None.
     `guides`: number of guide strands. `cards`: ribbons of the finest level of glTF; each further
     level has a quarter of them. The most make a texture of 16,384 pixels, the limit of graphics
     cards.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from stage_service.cli.support.commands import (
 if TYPE_CHECKING:
     from appearance.export.groom import Groom
     from appearance.export.options import ExportOptions
-    from reconstruction import Capture, Mesh, Model, Strands
+    from reconstruction import Capture, Mesh, Strands
     from reconstruction.arrays import Ints
     from reconstruction.geometry.world_frame import WorldFrame
 
@@ -54,7 +55,7 @@ def add(commands: Commands) -> None:
     export.add_argument(
         "--strands",
         type=int,
-        help="export a random subset, with larger radius to keep the coverage",
+        help="export so many: a random subset, or more between them; radii keep the coverage",
     )
     export.add_argument(
         "--guides", type=int, help="number of guide strands, exported separately (default: 0)"
@@ -87,8 +88,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     cyHair and PLY. Results of imported captures come in the user's world: usd, abc, hair and ply in
     the unit and axes of the cameras' files, the others in their own.
     """
-    from appearance.export.groom import Groom, thinned
+    from appearance.export.groom import Groom
     from appearance.export.options import ExportOptions
+    from appearance.export.resizing import resized
     from reconstruction import Capture, Model, parse_options, read_obj, write_strands
     from reconstruction.model import FILES
 
@@ -125,10 +127,13 @@ def run(args: argparse.Namespace, output: Output) -> None:
         head = model.head(capture)
         if args.head is not None:
             head = read_obj(args.head) if world is None else world.inputs(read_obj(args.head))
-        moved, figures = _collided(model, head, args, output)
+        strands, ids = resized(model.strands(), options.strands, options.seed)
+        options = replace(options, strands=None)
+        (strands, of), figures = _collided(strands, head, args, output)
+        moved = strands, ids[of]
     if args.to in STRANDS:
         strands = model.strands() if moved is None else moved[0]
-        strands, _ = thinned(strands, options.strands, options.seed)
+        strands, _ = resized(strands, options.strands, options.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_strands(out, strands, world)
         files = [out]
@@ -151,15 +156,17 @@ def run(args: argparse.Namespace, output: Output) -> None:
 
 
 def _collided(
-    model: Model, head: Mesh | None, args: argparse.Namespace, output: Output
+    strands: Strands, head: Mesh | None, args: argparse.Namespace, output: Output
 ) -> tuple[tuple[Strands, Ints], dict[str, Any]]:
     """The strands after `--collide`, the index of each one's original, and figures to print."""
     from reconstruction.geometry.collisions import Collisions
 
     if head is None:
-        raise BadArgument(f"--collide needs a head, which {model} lacks: give --head or --capture")
+        raise BadArgument(
+            f"--collide needs a head, which {args.model} lacks: give --head or --capture"
+        )
     try:
-        found = Collisions(model.strands(), head)
+        found = Collisions(strands, head)
     except ValueError as error:
         raise BadArgument(f"--collide: {args.head or 'the head'}: {error}") from error
     figures = {"inside_head": found.inside.figures()}

@@ -22,7 +22,7 @@ from appearance import Exposure, FittedModel, HairAppearance, HeldOut, Sampling,
 from appearance.bsdf.maps import HairMaps
 from appearance.export.blender import export_blender
 from appearance.export.cards import export_gltf, make_cards
-from appearance.export.groom import Groom, clumps, shapes, thinned
+from appearance.export.groom import Groom, clumps, shapes
 from appearance.export.mitsuba import View, export_mitsuba
 from appearance.export.options import ExportOptions
 from appearance.export.unreal import export_unreal
@@ -58,28 +58,6 @@ def mapped(fitted):
     sigma_a = base.sigma_a * np.array([0.5, 1.0, 2.0])[:, None, None, None]
     sigma_a[:, :2] = (0.05, 0.9, 1.1)
     return fitted.with_maps(replace(base, sigma_a=sigma_a))
-
-
-def test_thinned_strands_cover_what_all_did():
-    """Of one strand of 3 cm and two of 1 cm: 5 cm of radius r, or 3 cm of 5/3 r."""
-    lines = [np.array([[x, 0, 0], [x, 0, z]]) for x, z in ((0, 0.03), (1, 0.01), (2, 0.01))]
-    strands = Strands.from_list(lines, radius=3e-5)
-    radius = {0: 5e-5, 1: 15e-5, 2: 15e-5}
-    for seed in range(6):
-        few, (kept,) = thinned(strands, 1, seed)
-        assert few.radius == pytest.approx(radius[kept], rel=1e-6)
-        np.testing.assert_array_equal(few.points, strands[kept])
-    vary = replace(strands, radius=np.float32([1, 1, 4, 4, 2, 2]) * 1e-5)
-    few, (kept,) = thinned(vary, 1, 0)
-    area = {0: 3.0, 1: 4.0, 2: 2.0}  # 3·1, 1·4, 1·2 in all 9
-    np.testing.assert_allclose(few.radius, vary.radius[2 * kept] * 9 / area[kept], rtol=1e-6)
-    assert thinned(strands, 7, 0)[0] is strands
-
-
-def test_strands_without_length_are_thinned_as_they_are():
-    still = Strands.from_list([np.zeros((2, 3))] * 4, radius=3e-5)
-    few, _ = thinned(still, 2, 0)
-    assert (len(few), few.radius) == (2, 3e-5)
 
 
 def test_a_strand_straight_off_the_head_is_a_card_with_a_side(fitted, tmp_path):
