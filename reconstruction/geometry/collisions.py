@@ -105,9 +105,9 @@ class Collisions:
 
         "push" moves parts inside along the skin, with the strand's own length from the root; hair
         behind such a part slides along its curve. A root inside moves to the skin, others stay. A
-        strand for which no way is found, as through an ear, stays as it is. "cut" drops the parts
-        inside: each part outside of at least `STEP` metres becomes a strand that begins at its root
-        or where it leaves the skin.
+        strand without such a way of its own length and without kinks, as in an ear, stays as it is.
+        "cut" drops the parts inside: each part outside of at least `STEP` metres becomes a strand
+        that begins at its root or where it leaves the skin.
         """
         every = np.arange(len(self.strands))
         if how == "count" or not len(self.index):
@@ -156,7 +156,8 @@ class Collisions:
             lines, np.split(path, ends), np.split(share > 0, ends), strict=True
         ):
             new = np.concatenate([_slid(line[:, :3], way, moved), line[:, 3:]], axis=1)
-            pushed.append(line if (self.distance(new[:, :3])[0] < -SKIN).any() else new)
+            outside = (self.distance(new[:, :3])[0] >= -SKIN).all()
+            pushed.append(new if outside and _alike(line[:, :3], new[:, :3]) else line)
         return pushed
 
     def _along_skin(self, start: Array, targets: list[Array]) -> list[Array]:
@@ -224,6 +225,16 @@ def _slid(line: Array, path: Array, moved: Bools) -> Array:
     end = path[-1] + unit_or_zero(path[-1:] - path[-2:-1])[0] * max(own[-1] - arc[-1], 0)
     path, arc = np.concatenate([path, [end]]), np.append(arc, max(own[-1], arc[-1]))
     return np.where((own < before)[:, None], line, _at(path, arc, own))
+
+
+def _alike(line: Array, new: Array) -> bool:
+    """Whether `new (n, 3)` is as long as `line (n, 3)` to 1 %, with no sharper turn above 60°."""
+    (long, sharp), (as_long, as_sharp) = (
+        (_arc(x)[-1], (d[1:] * d[:-1]).sum(axis=1).min(initial=1.0))
+        for x in (line, new)
+        for d in [unit_or_zero(np.diff(x, axis=0))]
+    )
+    return bool(abs(as_long - long) <= 0.01 * long and as_sharp >= min(sharp, 0.5))
 
 
 def _outside(line: Array, height: Array) -> list[Array]:
