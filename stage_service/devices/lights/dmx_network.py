@@ -121,7 +121,7 @@ class _NetworkBank(DmxBank):
 
 
 class SacnBank(_NetworkBank):
-    """Lamps on sACN receivers; `close` ends the stream, and receivers act as on its loss."""
+    """Lamps on sACN receivers; `close` darkens them and ends the stream."""
 
     config: SacnConfig
     last_universe = 63999
@@ -135,8 +135,9 @@ class SacnBank(_NetworkBank):
     def close(self) -> None:
         with self._lock, suppress(OSError):
             self._options = _TERMINATED
+            dark = [bytes(CHANNELS)] * len(self._frames)  # receivers may hold the last frame
             for _ in range(_TERMINATIONS if self._socket is not None else 0):
-                self._send(self._frames)
+                self._send(dark)
         super().close()
         self._options = 0
 
