@@ -58,7 +58,7 @@ def test_more_strands_fill_the_gaps_evenly_in_the_same_direction():
     per_mm2 = np.histogram2d(*many.roots[:, :2].T, bins=50, range=[[4.5e-3, 54.5e-3]] * 2)[0]
     assert per_mm2.mean() == pytest.approx(9, rel=0.1)
     assert per_mm2.std() < 3  # as many of random places: 3
-    # every given strand is among them, as it was
+    # every given strand is among them, unchanged
     assert cKDTree(many.roots).query(given.roots)[0].max() == 0
 
 
