@@ -443,6 +443,11 @@ def test_hair_inside_a_head_is_counted_pushed_out_or_cut(made, capsys, tmp_path)
     code, found = run(capsys, *usd, "--out", tmp_path / "c.usdc", "--collide", "cut")
     assert code == 0
     assert len(read_strands(tmp_path / "c.usdc")) == 400
+    for count in (50, 300):  # strands that are added are cut, too
+        many = (*words, "--out", tmp_path / "c.hair", "--collide", "cut", "--strands", count)
+        code, found = run(capsys, *many)
+        assert (code, found["inside_head"]["strands"]) == (0, count)
+        assert len(read_strands(tmp_path / "c.hair")) == 2 * count
     code, found = run(capsys, *words, "--out", tmp_path / "n.hair")
     assert code != 0
     assert "--head needs --collide" in found["error"]["detail"]
