@@ -103,7 +103,8 @@ def test_a_dead_machine_keeps_the_stage_until_a_person_releases_it(simulated, be
         dead.start(CapturePlan(projectors=()))
     dead.close()
     capture = second.start(CapturePlan(projectors=()))
-    assert second.wait(capture, 60).outcome == "completed"
+    found = second.wait(capture, 60)
+    assert found.outcome == "completed", found.error
 
 
 def test_the_stage_of_a_killed_service_is_taken(simulated, begin, tmp_path):
