@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.folder import Capture
+from reconstruction.capture.records import origin
 from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.voxels import VoxelGrid
@@ -144,6 +145,7 @@ class MeasuringStages(Stages):
             masks = usable_masks(capture, every, stage)
             stage.figures["hair_pixels"] = {k: int(m.hair.sum()) for k, m in masks.items()}
             stage.figures["source"] = {k: m.source for k, m in masks.items()}
+            stage.figures["capture"] = origin(whole.plan)
         return MaskedCapture(capture, masks)
 
     def lines(

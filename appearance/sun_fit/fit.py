@@ -24,6 +24,7 @@ from appearance.scene.hair_scene import HairScene, build_scene
 from appearance.sun_fit.fit_pixels import (
     COVERED,
     FitPixels,
+    check_strands,
     covered,
     in_front,
     observed_pixels,
@@ -95,8 +96,9 @@ def fit(
         pixels = observed_pixels(training, model, options, stage, progress, seed)
         exposure = Exposure.of([o.radiance[o.valid] for o in pixels.hair])
         pixels = reached(training, pixels, exposure, stage)
-    head = model.head(capture)
-    scene = build_scene(strands, head, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N))
+        head = model.head(capture)
+        scene = build_scene(strands, head, hair=HairAppearance((0.1, 0.1, 0.1), 0.3, BETA_N))
+        check_strands(training, model, scene, stage, seed)
     fitting = SunFit(scene, pixels, options, seed, progress)
     with report.stage("roughness") as stage:
         found = fitting.roughness(stage) if training.olat_lights() else None

@@ -14,11 +14,15 @@ from appearance.scene.hair_scene import SCALE, HairScene
 from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model, Progress, Stage
 from reconstruction.arrays import Array
+from reconstruction.capture.records import origin
 
 SKIN_PIXELS = 200
 """Skin pixels read from each camera."""
 COVERED = 0.9
 """Share of a pixel that the model's hair, or skin, covers where colours are compared."""
+FOREIGN = 0.1
+"""Share of the strands in view outside a camera's hair mask above which a user is warned."""
+_SAMPLES = 4000  # pixels of a camera for that share
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,36 @@ def reached(training: Capture, pixels: FitPixels, exposure: Exposure, stage: Sta
         raise ValueError(f"{training.path}: no light reaches a hair pixel")
     stage.figures["lights_that_reach_hair"] = len(lit)
     return FitPixels(*([o.under(lit) for o in some] for some in (pixels.hair, pixels.skin)))
+
+
+def check_strands(
+    training: Capture, model: Model, scene: HairScene, stage: Stage, seed: int
+) -> None:
+    """Warn of strands and masks that are probably of another capture.
+
+    `stage` gets the share, by camera, of the pixels covered by strands that its hair mask lacks.
+    """
+    origins = [s.figures.get("capture") for s in model.report().stages if s.name == "masks"]
+    if origins and None not in (made := origins[0], this := origin(training.plan)) and made != this:
+        stage.warn(
+            f"The model's masks are those of another capture, {made}, not of this one, {this}: "
+            "run hairstage reconstruct on this one, unless nothing has moved."
+        )
+    rng, outside = np.random.default_rng(seed), {}
+    for camera in training.rig.cameras:
+        mask = model.mask(camera.name, "hair", training).reshape(-1)
+        pixels = chosen(np.ones_like(mask), _SAMPLES, rng)
+        shown = pixels[pixel_coverage(scene, camera, pixels)["hair"] >= COVERED]
+        if len(shown):
+            outside[camera.name] = float(1 - mask[shown].mean())
+    stage.figures["strands_outside_masks"] = outside
+    if outside and max(outside.values()) > FOREIGN:
+        worst = max(outside, key=lambda name: outside[name])
+        stage.warn(
+            f"{outside[worst]:.0%} of the strands that {worst} shows lie outside its hair mask "
+            f"(more than {FOREIGN:.0%} in {sum(x > FOREIGN for x in outside.values())} of "
+            f"{len(outside)} cameras): check that strands and cameras are of this capture."
+        )
 
 
 def covered(pixels: FitPixels, scene: HairScene) -> FitPixels:

@@ -114,7 +114,8 @@ def binned(samples: MirrorSamples, *, seed: int = 0) -> LobeBins:
     if counts.sum() < 100 or len(keep) < 8:
         raise ValueError(
             f"only {counts.sum()} samples in {len(keep)} of {BINS} bins lie near the mirror "
-            "direction: the roughness needs more lights, or more hair pixels of one direction"
+            "direction: the roughness needs more lights, more hair pixels of one direction, or "
+            "strands of this capture"
         )
     rng = np.random.default_rng(seed)
     by_bin = np.split(np.argsort(bin_of, kind="stable"), np.cumsum(counts))

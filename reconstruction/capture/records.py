@@ -100,6 +100,12 @@ def read_steps(plan: dict[str, Any]) -> tuple[Step, ...]:
     return tuple(Step.from_dict(s) for s in steps)
 
 
+def origin(plan: dict[str, Any]) -> str | None:
+    """When a plan was shot, or the folder it was imported from; None where neither is recorded."""
+    found = plan.get("started", plan.get("imported_from"))
+    return None if found is None else str(found)
+
+
 def read_journal(path: Path) -> dict[tuple[int, str], FrameRecord]:
     """Records by (step, camera); later lines replace earlier ones. Raises `CaptureError`.
 

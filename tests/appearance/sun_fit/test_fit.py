@@ -12,6 +12,7 @@ from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
 from appearance.sun_fit import roughness_and_colour
+from appearance.sun_fit.fit_pixels import check_strands
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.options import FitOptions
 from reconstruction import (
@@ -295,3 +296,33 @@ def test_an_appearance_of_an_earlier_version_renders_without_a_spread(tmp_path):
     del data["beta_m_error"], data["beta_m_interval"]
     path.write_text(json.dumps({**data, "fibres": {"beta_m": 0.2, "error": 0.1}}))
     assert FittedAppearance.load(model) == FittedAppearance(*made)
+
+
+def test_strands_of_another_head_or_another_capture_are_named(made):
+    capture, model = made
+    own, other = Stage("samples"), Stage("samples")
+    head, strands = model.head(capture), model.strands()
+    moved = replace(strands, points=strands.points + np.float32([0.02, 0, 0]))
+    check_strands(capture, model, build_scene(strands, head, hair=TRUTH), own, 0)
+    check_strands(capture, model, build_scene(moved, head, hair=TRUTH), other, 0)
+    assert own.warnings == []
+    # half of a curtain 40 mm wide hangs beside its picture
+    shares = other.figures["strands_outside_masks"]
+    assert all(0.35 < share < 0.65 for share in shares.values())
+    assert "in 3 of 3 cameras" in other.warnings[0]
+
+
+def test_masks_of_another_capture_are_named(made, tmp_path):
+    capture, model = made
+    report = Report([Stage("masks", figures={"capture": "monday"})])
+    report.save(tmp_path / "report.json")
+    ours = Model(tmp_path)
+    ours.write_strands(model.strands())
+    for camera in capture.rig.cameras:
+        ours.write_mask(camera.name, "hair", model.mask(camera.name, "hair", capture))
+    scene = build_scene(model.strands(), model.head(capture), hair=TRUTH)
+    for shot, expected in (("monday", 0), ("tuesday", 1)):
+        again, stage = Capture(capture.path), Stage("samples")
+        again.plan["started"] = shot
+        check_strands(again, ours, scene, stage, 0)
+        assert ["monday" in w and "tuesday" in w for w in stage.warnings] == expected * [True]
