@@ -29,8 +29,8 @@ def chosen_variant(variant: str | None = None) -> str:
         os.environ["DRJIT_LIBLLVM_PATH"] = find_libllvm()
     if chosen.startswith("cuda") and not drjit.has_backend(drjit.JitBackend.CUDA):
         raise BackendError(
-            f"{chosen} needs an NVIDIA GPU with its driver, and none was found: unset {VARIANT} to "
-            "run on the CPU"
+            f"{chosen} needs an NVIDIA GPU with its driver, and none was found: without --gpu, and "
+            f"without {VARIANT} in the environment, the CPU is used"
         )
     return chosen
 

@@ -1,4 +1,4 @@
-"""As many strands as an export asks for: some of a model's, or more between them."""
+"""Another number of strands for an export: some of a model's, or more between them."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ READY_S = 300.0
 def add(commands: Commands) -> None:
     """Add the command."""
     remains = "lamps and processes are off; the next demo in the same folder begins anew"
-    demo = add_command(commands, "demo", run_demo, interrupted=remains)
+    demo = add_command(commands, "demo", run_demo, interrupted=remains, renders=True)
     add_subject(demo)
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="output folder")
     demo.add_argument("--environment", default="studio", help="studio, sky, .hdr or .exr file")

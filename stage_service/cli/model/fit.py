@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Add the command."""
     remains = "the same command resumes inverse rendering and fields, and begins a sun fit anew"
-    fit = add_command(commands, "fit", run, interrupted=remains)
+    fit = add_command(commands, "fit", run, interrupted=remains, renders=True)
     fit.add_argument("capture", type=Path)
     fit.add_argument("model", type=Path, help="model folder with strands.npz")
     fit.add_argument(

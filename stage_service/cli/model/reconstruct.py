@@ -31,7 +31,7 @@ MEMORY_SHARE = 0.8  # of this machine's memory; above it, a larger --reduce is s
 def add(commands: Commands) -> None:
     """Add the command."""
     remains = "the same command begins anew"
-    reconstruct = add_command(commands, "reconstruct", run, interrupted=remains)
+    reconstruct = add_command(commands, "reconstruct", run, interrupted=remains, renders=True)
     reconstruct.add_argument("capture", type=Path)
     reconstruct.add_argument("--method", choices=METHODS, default="auto")
     reconstruct.add_argument("--out", type=Path, help="model folder")

@@ -26,7 +26,7 @@ FRAMES = 24
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    render = add_command(commands, "render", run, interrupted="no image was written")
+    render = add_command(commands, "render", run, interrupted="no image was written", renders=True)
     render.add_argument("model", type=Path)
     render.add_argument("--capture", type=Path, help="the capture, for its rig and head")
     render.add_argument("--camera", help="a camera of the rig, instead of a three-quarter view")

@@ -148,11 +148,13 @@ def add_command(
     run: Callable[..., int | None],
     help: str | None = None,
     interrupted: str = "",
+    renders: bool = False,
 ) -> argparse.ArgumentParser:
     """Add a command with `--json` and `--debug`, its help, and `run`, the function that runs it.
 
     The help is the docstring of `run`: its first sentence, and the rest as the description.
-    `interrupted` says what remains of an interrupted run, and what the next one does.
+    `interrupted` says what remains of an interrupted run, and what the next one does. A command
+    that `renders` has `--gpu`.
     """
     first, _, rest = (inspect.getdoc(run) or "").partition("\n\n")
     help = help or _phrase(first)
@@ -161,6 +163,9 @@ def add_command(
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
+    if renders:
+        text = "run on an NVIDIA GPU, as $HAIRSTAGE_VARIANT=cuda_ad_rgb does; without, on the CPU"
+        parser.add_argument("--gpu", dest="on_gpu", action="store_true", help=text)
     parser.set_defaults(run=run, interrupted=interrupted)
     return parser
 
@@ -257,6 +262,8 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
     debug = getattr(args, "debug", False)
     try:
         with terminable(), contextlib.redirect_stdout(sys.stderr):  # OpenEXR prints warnings
+            if getattr(args, "on_gpu", False):
+                _choose_gpu(output)
             return args.run(args, output) or 0
     except (KeyboardInterrupt, Terminated) as stop:
         what, code = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
@@ -283,6 +290,14 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> 
         if debug:
             traceback.print_exc(file=sys.stderr)
         return code
+
+
+def _choose_gpu(output: Output) -> None:
+    """Let this process and its children run on the GPU. Raises `BackendError` where none is."""
+    from reconstruction.array_backend import VARIANT, chosen_variant
+
+    os.environ[VARIANT] = "cuda_ad_rgb"
+    output.note(f"running on the GPU ({chosen_variant()})")
 
 
 def _stored_trace() -> str:

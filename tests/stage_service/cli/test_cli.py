@@ -112,6 +112,20 @@ def test_a_fault_is_one_sentence_with_its_traceback_in_a_file(capsys, tmp_path, 
     assert bool(rest) == debug == (not files)
 
 
+@pytest.mark.parametrize("found", [False, True])
+def test_gpu_runs_on_cuda_or_is_refused_with_what_to_do(capsys, monkeypatch, found):
+    monkeypatch.setattr("drjit.has_backend", lambda backend: found)
+    monkeypatch.delenv("HAIRSTAGE_VARIANT", raising=False)
+    monkeypatch.setattr("os.environ", dict(os.environ))
+    args = build_parser().parse_args(["fit", "capture", "model", "--gpu"])
+    args.run = lambda args, output: print(os.environ["HAIRSTAGE_VARIANT"])
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", lambda self, given: args)
+    assert run_command(argparse.ArgumentParser(), []) == (0 if found else 1)
+    said = capsys.readouterr().err
+    expected = "running on the GPU (cuda_ad_rgb)\ncuda_ad_rgb\n" if found else "without --gpu"
+    assert expected in said
+
+
 def test_wrong_usage_is_exit_code_2(capsys):
     with pytest.raises(SystemExit) as error:
         main(["reconstruct"])
