@@ -21,7 +21,7 @@ from pydantic import (
 from reconstruction import Rig
 from reconstruction.containment import LONGEST_NAME
 from reconstruction.geometry.rig import RigError
-from stage_service.device_config import DevicesConfig, GenicamConfig, Seconds, Strict
+from stage_service.device_config import DevicesConfig, NumberedCamerasConfig, Seconds, Strict
 from stage_service.wire_names import unfit_projectors, unfit_serials
 
 SHORTEST_S, LONGEST_S = 1e-6, 10.0  # the trigger box's range of exposures
@@ -131,7 +131,7 @@ def _check_names(path: Path, rig: Rig, devices: DevicesConfig | None) -> None:
     unfit: list[str] = []
     if devices is not None and devices.projectors is not None:
         unfit += unfit_projectors([p.name for p in rig.projectors])
-    if devices is not None and isinstance(devices.cameras, GenicamConfig):
+    if devices is not None and isinstance(devices.cameras, NumberedCamerasConfig):
         unfit += unfit_serials(devices.cameras.serials, [c.name for c in rig.cameras])
     if unfit:
         raise RigError(f"{path}: " + "; ".join(unfit))
@@ -152,7 +152,10 @@ def _place(loc: tuple[int | str, ...]) -> str:
     return ".".join(str(p) for p in loc if p not in _KINDS)
 
 
-_KINDS = ("modbus_tcp", "modbus_rtu", "dmx_enttec", "sacn", "artnet", "link", "basler", "aravis")
+_KINDS = (
+    *("modbus_tcp", "modbus_rtu", "dmx_enttec", "sacn", "artnet"),
+    *("link", "basler", "aravis", "gphoto2"),
+)
 
 
 def _validate(path: Path, tables: dict[str, Any]) -> _Tables:

@@ -202,6 +202,12 @@ class _Cameras(Strict):
     bytes_per_s: float = Field(default=100e6, gt=0.0)
     buffers: int = Field(default=64, ge=1, le=4096)
 
+    @property
+    def lag_s(self) -> float:
+        """Seconds from the pulse to the open shutter at most, while the lamps are on; 0 for cameras
+        that the trigger box fires."""
+        return 0.0
+
 
 class LinkCamerasConfig(_Cameras):
     """`[devices.cameras]`: the camera link.
@@ -215,25 +221,17 @@ class LinkCamerasConfig(_Cameras):
     busy_s: Seconds = 60.0
 
 
-class GenicamConfig(_Cameras):
-    """Fields of every GenICam camera, found by serial number.
+class NumberedCamerasConfig(_Cameras):
+    """Fields of cameras that are found by serial number.
 
-    `serials` maps each camera of the rig file to its number. `gain`, counts per (W/(sr m²) · s),
-    and `black`, counts, are calibrated. `features` are written to the camera in their order after
-    its default settings: region of interest, analog gain, black level, packet size. `timeout_s` is
-    the deadline of arming; a frame may come `frame_s` after its exposure.
+    `serials` maps each camera of the rig file to its number. `gain`, counts per (W/(sr m²) · s), is
+    calibrated. `timeout_s` is the deadline of arming; a frame may come `frame_s` after its
+    exposure.
     """
 
     serials: dict[str, Annotated[str, Field(min_length=1)]]
     gain: float = Field(gt=0.0)
-    black: float = Field(default=0.0, ge=0.0)
-    pixel_format: str = Field(
-        default="BayerRG12", pattern="^(Mono|Bayer(RG|GR|GB|BG))(8|10|12|16)$"
-    )
-    trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
-    features: dict[str, bool | int | float | str] = Field(default_factory=dict)
     frame_s: Seconds = 0.5
-    buffers: int = Field(default=16, ge=1, le=4096)
 
     @field_validator("serials")
     @classmethod
@@ -241,6 +239,22 @@ class GenicamConfig(_Cameras):
         if len(set(serials.values())) < len(serials):
             raise ValueError("two cameras have the same serial number")
         return serials
+
+
+class GenicamConfig(NumberedCamerasConfig):
+    """Fields of every GenICam camera.
+
+    `black`, counts, is calibrated. `features` are written to the camera in their order after its
+    default settings: region of interest, analog gain, black level, packet size.
+    """
+
+    black: float = Field(default=0.0, ge=0.0)
+    pixel_format: str = Field(
+        default="BayerRG12", pattern="^(Mono|Bayer(RG|GR|GB|BG))(8|10|12|16)$"
+    )
+    trigger_line: str = Field(default="Line1", pattern=r"^Line\d+$")
+    features: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    buffers: int = Field(default=16, ge=1, le=4096)
 
 
 class BaslerConfig(GenicamConfig):
@@ -255,8 +269,31 @@ class AravisConfig(GenicamConfig):
     kind: Literal["aravis"]
 
 
+class Gphoto2Config(NumberedCamerasConfig):
+    """`[devices.cameras]`: DSLRs and mirrorless cameras on USB, through libgphoto2.
+
+    `serials` may have a USB port, "usb:001,005". `settings` are written to the camera in their
+    order. The shutter is open within `release_s` of the release, while the lamps are already on.
+    `jpeg`: frames are JPEG, by the sRGB curve, not RAW. `keep` leaves the files on the card.
+    """
+
+    kind: Literal["gphoto2"]
+    settings: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    release_s: Seconds = 1.0
+    jpeg: bool = False
+    keep: bool = False
+    timeout_s: Seconds = 10.0
+    frame_s: Seconds = 10.0
+    readout_s: float = Field(default=1.0, ge=0.0)
+    buffers: Literal[1] = 1
+
+    @property
+    def lag_s(self) -> float:
+        return self.release_s
+
+
 CamerasConfig = Annotated[
-    LinkCamerasConfig | BaslerConfig | AravisConfig, Field(discriminator="kind")
+    LinkCamerasConfig | BaslerConfig | AravisConfig | Gphoto2Config, Field(discriminator="kind")
 ]
 
 
@@ -282,5 +319,14 @@ class DevicesConfig(Strict):
             raise ValueError(
                 f"heartbeat_s {self.heartbeat_s} must be at most half of watchdog_s "
                 f"{self.watchdog_s}, or one late beat switches the lamps off"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _fired_by_the_box(self) -> DevicesConfig:
+        if self.hardware_stepping and self.cameras.lag_s:
+            raise ValueError(
+                f"hardware_stepping: the trigger box cannot fire cameras of {self.cameras.kind}, "
+                "which the service releases over USB: set it to false"
             )
         return self

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 LONGEST_PROJECTOR_NAME = 32
 """Characters, so that the longest request, ENTRY, fits into 96."""
 _PROJECTOR = re.compile(rf"[A-Za-z0-9._-]{{1,{LONGEST_PROJECTOR_NAME}}}")
-_SERIAL_NUMBER = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_SERIAL_NUMBER = re.compile(r"[A-Za-z0-9._-]{1,64}|usb:\d+,\d+")
 _CHARACTERS = "the letters A to Z and a to z, digits, '.', '_' and '-'"
 
 

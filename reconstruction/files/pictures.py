@@ -32,6 +32,7 @@ from reconstruction.files.encoded import (
     turned,
 )
 from reconstruction.files.exr import OtherChannels, read_exr
+from reconstruction.files.mosaics import read_mosaic
 from reconstruction.files.tiff_tags import dng_levels
 from reconstruction.options import options
 
@@ -307,23 +308,14 @@ def _check_bits(path: Path, values: NDArray[Any]) -> None:
 
 def _raw(path: Path, sensor: Sensor) -> Picture:
     try:
-        with rawpy.imread(str(path)) as raw:
-            values, pattern = raw.raw_image_visible.copy(), raw.raw_pattern
-            colours = raw.color_desc.decode()
-            sites = raw.raw_colors_visible.copy()
-            blacks, whites = raw.black_level_per_channel, raw.camera_white_level_per_channel
-            white = np.full(4, float(raw.white_level))
+        mosaic = read_mosaic(str(path))
     except Exception as error:
         raise PictureError(broken(path, error)) from error
-    bayer = ""
-    if pattern is not None and pattern.shape == (2, 2) and values.ndim == 2:
-        bayer = "".join(colours[i] for i in pattern.ravel())
+    values, bayer, sites = mosaic.values, mosaic.bayer, mosaic.sites
     if bayer not in MOSAICS:
         raise PictureError(f"{path}: not a Bayer mosaic: develop it to a linear 16-bit TIFF")
-    if whites is not None and all(0 < w <= white[0] for w in whites):
-        white = np.array(whites, float)  # where the sensor clips, from the maker's notes
     try:
-        levels = np.array(blacks, float)[sites], white[sites]
+        levels = mosaic.black[sites], mosaic.white[sites]
         if path.suffix.lower() == ".dng":
             levels = dng_levels(path, values.shape, sites)
     except ValueError as error:

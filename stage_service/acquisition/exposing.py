@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from reconstruction import Step
 from stage_service.acquisition.timings import Timings
+from stage_service.devices.cameras.fan_out import FanOut
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import CONTRADICTED, lamps_lit, mismatch_todo
@@ -47,8 +48,11 @@ class Exposing:
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
 
-    def expose(self, step: Step) -> Pulse:
-        """Make one pulse in the step's light."""
+    def expose(self, step: Step, cameras: FanOut) -> Pulse:
+        """Make one pulse in the step's light, and release the cameras that it does not fire.
+
+        The light goes off when the exposure must be over, whether or not the cameras reply.
+        """
         timings = self._timings
         with timings.on("rate limit"):
             self._sleep(self._next - time.monotonic())
@@ -63,9 +67,12 @@ class Exposing:
             requested = time.monotonic()
             count = self._devices.trigger.pulse(step.exposure)
             pulse = Pulse(count, requested, time.monotonic())
+            lag = self._devices.config.cameras.lag_s
+            if lag:
+                cameras.start(lambda camera: camera.release())
         # Counted from the box's reply, which never precedes the pulse: the light stays long enough.
         with timings.on("exposure"):
-            self._sleep(step.exposure)
+            self._sleep(lag + step.exposure)
         with timings.on("lights"):
             self._check_lamps(step)
             self._check_projectors(step)

@@ -305,7 +305,7 @@ class Sequencer:
         for attempt in range(self._retries + 1):
             if not intake.ready(step.exposure):
                 intake.arm(step.exposure, cameras)
-            pulse = self._exposing.expose(step)
+            pulse = self._exposing.expose(step, cameras)
             intake.pulses.fired(pulse.count)
             shot = intake.read(cameras)
             for camera in self.devices.cameras:

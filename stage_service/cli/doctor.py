@@ -41,6 +41,7 @@ print(json.dumps([variant, library, drjit.has_backend(drjit.JitBackend.CUDA)]))
 EXTRAS = {
     "basler": ("pypylon", "Basler cameras"),
     "aravis": ("gi", "other GenICam cameras"),
+    "gphoto2": ("gphoto2", "DSLRs"),
     "alembic": ("alembic3d", "Alembic files"),
 }
 

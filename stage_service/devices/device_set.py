@@ -14,12 +14,14 @@ from stage_service.device_config import (
     BaslerConfig,
     DevicesConfig,
     DmxConfig,
+    Gphoto2Config,
     LightBankConfig,
     SacnConfig,
 )
 from stage_service.devices.cameras.aravis import AravisCamera
 from stage_service.devices.cameras.basler import BaslerCamera
 from stage_service.devices.cameras.fan_out import FanOut
+from stage_service.devices.cameras.gphoto2 import Gphoto2Camera
 from stage_service.devices.cameras.interface import Busy, CameraDevice
 from stage_service.devices.cameras.link import LinkCamera
 from stage_service.devices.errors import DeviceError
@@ -72,6 +74,8 @@ class DeviceSet:
             cameras: list[CameraDevice] = [BaslerCamera(config.cameras, c) for c in rig.cameras]
         elif isinstance(config.cameras, AravisConfig):
             cameras = [AravisCamera(config.cameras, c) for c in rig.cameras]
+        elif isinstance(config.cameras, Gphoto2Config):
+            cameras = [Gphoto2Camera(config.cameras, c) for c in rig.cameras]
         else:
             cameras = [LinkCamera(config.cameras, c) for c in rig.cameras]
         projectors = None

@@ -87,7 +87,10 @@ class ResolvedPlan:
         )
         lag = causes["storage"] / len(steps)
         lights = timeline(self.runs, self.rig_file, rate_hz=rate_hz, lag_s=lag)
-        lamp_seconds, dose = dose_of(rig, steps, causes["settle"] / len(steps) + LATENCY_S)
+        devices = self.rig_file.devices
+        overhead = causes["settle"] / len(steps) + LATENCY_S
+        overhead += 0.0 if devices is None else devices.cameras.lag_s
+        lamp_seconds, dose = dose_of(rig, steps, overhead)
         clocked = Counter({"software": 0, "hardware": 0})
         for run in self.runs:
             clocked[run.stepping] += len(run.steps)

@@ -113,10 +113,11 @@ def seconds_by_cause(
                 causes["rate limit"] += waiting
                 causes["link"] += max(0.0, n * link - shooting - waiting)
             else:
-                causes["latency"] += n * LATENCY_S
+                latency = LATENCY_S + devices.cameras.lag_s
+                causes["latency"] += n * latency
                 causes["link"] += n * link
                 if rate_hz:
-                    busy = (t + LATENCY_S + link for t in own)
+                    busy = (t + latency + link for t in own)
                     causes["rate limit"] += sum(max(0.0, 1 / rate_hz - t) for t in busy)
     writing = len(steps) * folder_bytes / rig_file.capture.storage_bytes_per_s
     causes["storage"] = max(0.0, writing - sum(causes.values()))

@@ -28,16 +28,17 @@ def timeline(
     """
     devices = rig_file.devices
     now = 0.0
-    settle = readout = link = 0.0
+    settle = readout = link = lag = 0.0
     if devices is not None:
         settle, readout = devices.lights.settle_s, devices.cameras.readout_s
+        lag = devices.cameras.lag_s
         pixels = sum(c.width * c.height for c in rig_file.rig.cameras)
         link = 6 * pixels / devices.cameras.bytes_per_s
     for run in parts:
         began = now
         by_box = devices if run.stepping == "hardware" else None
         for step in run.steps:
-            lit = settle + step.exposure + (LATENCY_S if by_box is None else 0.0)
+            lit = settle + step.exposure + (lag + LATENCY_S if by_box is None else 0.0)
             if step.kind != "dark":
                 yield Lit(step, now, lit)
             if by_box is not None:

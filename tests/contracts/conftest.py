@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
+from dslrs import VIRTUAL_SERIAL, Body, FakeGphoto2, dslr, jpeg, plug_in_virtual
 from waiting import slowed
 
 from reconstruction import Projector
@@ -19,6 +22,8 @@ from simulators.peers.projector_controller import SimulatedProjectorController
 from simulators.peers.serial_peer import SerialPeer
 from simulators.peers.trigger_box import SimulatedTriggerBox
 from stage_service.device_config import SerialConfig
+from stage_service.devices.cameras import gphoto2
+from stage_service.devices.cameras.gphoto2 import Gphoto2Camera
 from stage_service.devices.projectors.serial_controller import SerialProjectorController
 from stage_service.devices.trigger.serial_box import SerialTriggerBox
 
@@ -243,3 +248,35 @@ def firmware(firmware_host: Path) -> Iterator[Callable[..., Firmware]]:
             return one
 
         yield start
+
+
+@pytest.fixture
+def virtual_nikon(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Callable[..., Gphoto2Camera]]:
+    """`virtual_nikon(picture=…, **fields)`: libgphoto2's virtual camera, not connected."""
+    with ExitStack() as stack:
+
+        def make(picture: bytes = jpeg(), **fields: Any) -> Gphoto2Camera:
+            plug_in_virtual(monkeypatch, tmp_path, picture)
+            camera = dslr(VIRTUAL_SERIAL, **fields)
+            stack.callback(camera.close)
+            return camera
+
+        yield make
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Gphoto2Camera]]:
+    """`stand_in(*bodies, **fields)`: a camera of the stand-in library, not connected."""
+    with ExitStack() as stack:
+
+        def make(*bodies: Body, **fields: Any) -> Gphoto2Camera:
+            found = bodies or (Body(),)
+            monkeypatch.setitem(sys.modules, "gphoto2", FakeGphoto2(*found))
+            monkeypatch.setattr(gphoto2, "_SERIALS", {})
+            camera = dslr(**{"serial": found[0].serial, **fields})
+            stack.callback(camera.close)
+            return camera
+
+        yield make

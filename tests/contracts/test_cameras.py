@@ -22,6 +22,7 @@ from reconstruction import Camera as Geometry
 from stage_service.device_config import AravisConfig, BaslerConfig
 from stage_service.devices.cameras.aravis import AravisCamera
 from stage_service.devices.cameras.basler import BaslerCamera
+from stage_service.devices.cameras.gphoto2 import Gphoto2Camera
 from stage_service.devices.cameras.interface import CameraDevice
 from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, DeviceTimeout, DeviceUnreachable
@@ -32,10 +33,11 @@ WIDTH, HEIGHT = 16, 12
 
 @dataclass
 class Rig:
-    """A camera that is not connected yet, and what fires it."""
+    """A camera that is not connected yet, what fires it, and two exposures that it can make."""
 
     camera: CameraDevice
     fire: Callable[[], object]
+    exposures: tuple[float, float] = (0.002, 0.004)
 
 
 @pytest.fixture
@@ -132,7 +134,19 @@ def aravis(fake_camera: FakeCamera) -> Rig:
     return Rig(fake_camera.camera, fake_camera.fire)
 
 
-@pytest.fixture(params=["link", "basler", "aravis"])
+@pytest.fixture
+def virtual_dslr(virtual_nikon: Callable[..., Gphoto2Camera]) -> Rig:
+    camera = virtual_nikon()
+    return Rig(camera, camera.release, (0.005, 0.01))
+
+
+@pytest.fixture
+def stand_in_dslr(stand_in: Callable[..., Gphoto2Camera]) -> Rig:
+    camera = stand_in()
+    return Rig(camera, camera.release, (0.002, 0.004))
+
+
+@pytest.fixture(params=["link", "basler", "aravis", "virtual_dslr", "stand_in_dslr"])
 def rig(request: pytest.FixtureRequest) -> Rig:
     one: Rig = request.getfixturevalue(request.param)
     one.camera.connect()
@@ -140,7 +154,7 @@ def rig(request: pytest.FixtureRequest) -> Rig:
 
 
 def test_an_armed_camera_sends_a_frame_per_pulse(rig):
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     frames = []
     for _ in range(4):
         rig.fire()
@@ -150,7 +164,7 @@ def test_an_armed_camera_sends_a_frame_per_pulse(rig):
         assert frame.counts.shape == (HEIGHT, WIDTH, 3)
         assert frame.counts.dtype == np.uint16
         assert frame.counts.max() <= rig.camera.info.full_scale
-        assert frame.exposure == pytest.approx(0.002, rel=0.01)
+        assert frame.exposure == pytest.approx(rig.exposures[0], rel=0.01)
         assert frame.left == 0
     if rig.camera.capabilities.timestamps:
         assert sorted({f.timestamp for f in frames}) == [f.timestamp for f in frames]
@@ -158,35 +172,35 @@ def test_an_armed_camera_sends_a_frame_per_pulse(rig):
 
 
 def test_frames_wait_until_they_are_read(rig):
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     for _ in range(3):
         rig.fire()
     assert [rig.camera.read(NEVER).block_id for _ in range(3)] == [1, 2, 3]
 
 
 def test_arming_drops_what_was_not_read_and_the_numbers_go_on(rig):
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     rig.fire()
     assert rig.camera.read(NEVER).block_id == 1
     rig.fire()
-    rig.camera.arm(0.004)
+    rig.camera.arm(rig.exposures[1])
     assert rig.camera.read(NEVER) is None
     rig.fire()
     frame = rig.camera.read(NEVER)
     # A camera that was armed again before it exposed makes no frame of that pulse, and no number.
     assert frame.block_id in (2, 3)
-    assert frame.exposure == pytest.approx(0.004, rel=0.01)
+    assert frame.exposure == pytest.approx(rig.exposures[1], rel=0.01)
 
 
 def test_a_disarmed_camera_sends_no_frame(rig):
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     rig.camera.disarm()
     rig.fire()
     assert rig.camera.read(NEVER) is None
 
 
 def test_a_read_can_be_cancelled_or_finds_nothing(rig):
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     cancel = threading.Event()
     cancel.set()
     with suppress(Cancelled):
@@ -196,7 +210,7 @@ def test_a_read_can_be_cancelled_or_finds_nothing(rig):
 def test_closed_it_can_be_connected_again(rig):
     rig.camera.close()
     rig.camera.connect()
-    rig.camera.arm(0.002)
+    rig.camera.arm(rig.exposures[0])
     rig.fire()
     assert rig.camera.read(NEVER).block_id == 1
 
@@ -204,7 +218,7 @@ def test_closed_it_can_be_connected_again(rig):
 def test_a_closed_camera_reports_that_it_is_closed(rig):
     rig.camera.close()
     with pytest.raises(DeviceError, match="cam_a"):
-        rig.camera.arm(0.002)
+        rig.camera.arm(rig.exposures[0])
 
 
 def test_aravis_waits_for_pulses_on_its_line_and_refuses_what_the_camera_has_not(fake_camera):

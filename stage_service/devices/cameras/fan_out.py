@@ -39,9 +39,7 @@ class FanOut:
         Raises the error of the only camera that failed, or an `ExceptionGroup` of several;
         `Cancelled` only where there is no other error.
         """
-        results: list[Future[T]] = [Future() for _ in self.cameras]
-        for work, result in zip(self._work, results, strict=True):
-            work.put((call, result))
+        results = self.start(call)
         while waiting is not None and wait(results, LOOK_S).not_done:
             waiting()
         errors = [e for r in results if isinstance(e := r.exception(), Exception)]
@@ -51,6 +49,13 @@ class FanOut:
         if errors:
             raise ExceptionGroup("; ".join(str(e) for e in errors), errors)
         return {c.name: r.result() for c, r in zip(self.cameras, results, strict=True)}
+
+    def start(self, call: Callable[[CameraDevice], T]) -> list[Future[T]]:
+        """`call(camera)` of every camera, before any later call of that camera."""
+        results: list[Future[T]] = [Future() for _ in self.cameras]
+        for work, result in zip(self._work, results, strict=True):
+            work.put((call, result))
+        return results
 
     def close(self) -> None:
         """Let the threads end."""

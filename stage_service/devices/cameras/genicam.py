@@ -135,6 +135,9 @@ class GenicamCamera(ABC):
             self._start(doing)
         self._exposure = actual
 
+    def release(self) -> None:  # noqa: B027
+        """Nothing: the trigger box fires it."""
+
     def disarm(self) -> None:
         """Ignore pulses from now on; unread frames are dropped."""
         with self._as_device_error("disarming"):

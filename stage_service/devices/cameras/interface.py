@@ -84,7 +84,8 @@ class Busy:
 
 
 class CameraDevice(Protocol):
-    """One camera that waits for hardware triggers. Every call raises `DeviceError`.
+    """One camera that waits for hardware triggers, or for `release`. Every call raises
+    `DeviceError`.
 
     `busy` is the camera's latest report while `read` waits, else None.
     """
@@ -105,6 +106,10 @@ class CameraDevice(Protocol):
 
     def arm(self, exposure: float) -> None:
         """Expose at the next pulses for `exposure` seconds; unread frames are dropped."""
+
+    def release(self) -> None:
+        """Expose now, on a camera without a trigger input, if it is armed; else do nothing. Returns
+        once the exposure is under way or over. `read` raises the errors."""
 
     def disarm(self) -> None:
         """Ignore pulses from now on."""

@@ -85,6 +85,9 @@ class LinkCamera:
         self._request({"op": "arm", "exposure": exposure}, f"arming for {exposure:g} s")
         self._armed = exposure
 
+    def release(self) -> None:
+        """Nothing: the trigger box fires it."""
+
     def disarm(self) -> None:
         self._request({"op": "disarm"}, "disarming")
         self._armed = None
