@@ -108,6 +108,7 @@ class Body:
     )
     files: dict[str, bytes] = field(default_factory=dict)
     shots: int = 0
+    releases: int = 0
     opened: list[tuple[float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -248,6 +249,7 @@ class _Camera:
 
     def trigger_capture(self) -> None:
         body = self._there(busy=True)
+        body.releases += 1
         shutter = shutter_seconds(body.settings["shutterspeed"].value)
         thread = threading.Thread(target=body.expose, args=(shutter,), daemon=True)
         thread.start()

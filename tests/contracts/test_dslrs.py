@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -150,7 +151,7 @@ def test_another_serial_number_lists_the_cameras_that_are_there(virtual_nikon):
     assert shoot(by_port, 0.005).block_id == 1
 
 
-def test_two_cameras_of_one_model_are_told_apart_and_opened_once(stand_in):
+def test_two_cameras_of_one_model_are_found_by_number_or_port_and_opened_once(stand_in):
     bodies = [
         Body(serial=str(n), port=f"usb:001,00{n}", picture=lambda n=n: jpeg(40 * n))
         for n in (1, 2, 3)
@@ -249,6 +250,24 @@ def test_a_release_that_outlasts_the_light_is_refused(stand_in):
     with pytest.raises(DeviceTimeout, match=r"within 0\.102 s, .*off by then: raise release_s"):
         shoot(stand_in(body, release_s=0.1))
     assert shoot(stand_in(body, release_s=30.0)).block_id == 1
+
+
+def test_a_release_that_hangs_delays_closing_by_its_deadline_alone(stand_in, slack):
+    body = Body(lag_s=0.5 * slack, blocks=True)
+    camera = stand_in(body, timeout_s=0.1)
+    camera.connect()
+    camera.arm(0.002)
+    release = threading.Thread(target=camera.release)
+    release.start()
+    until(lambda: body.releases)
+    began = time.monotonic()
+    camera.close()
+    with pytest.raises(DeviceTimeout, match=r"within 0\.1 s, received a camera that hangs"):
+        camera.connect()
+    assert time.monotonic() - began < 0.4 * slack
+    release.join()
+    body.lag_s = 0.0
+    assert shoot(camera).block_id == 1
 
 
 def test_two_files_a_frame_and_a_wrong_mode_dial_are_refused(stand_in):

@@ -181,11 +181,23 @@ def test_a_rig_without_a_projector_controller_may_call_its_projectors_as_it_like
         ('cam_00 = "0815 0000"', r"serials.cam_00: expected the letters.* got '0815 0000'"),
     ],
 )
-def test_serial_numbers_are_those_of_the_rig_s_cameras(tmp_path, serials, message):
-    cameras = '[devices.cameras]\nkind = "basler"\ngain = 1.0\n[devices.cameras.serials]\n'
+@pytest.mark.parametrize("kind", ["basler", "gphoto2"])
+def test_serial_numbers_are_those_of_the_rig_s_cameras(tmp_path, serials, message, kind):
+    cameras = f'[devices.cameras]\nkind = "{kind}"\ngain = 1.0\n[devices.cameras.serials]\n'
     text = SMALL.replace(
         "[devices.cameras]\nport = 15021\nbusy_s = 900.0\n", cameras + serials + "\n"
     )
     (path := tmp_path / "rig.toml").write_text(text)
     with pytest.raises(RigError, match=message):
+        load_rig_file(path)
+
+
+def test_cameras_that_the_service_releases_have_ports_and_no_hardware_stepping(tmp_path):
+    cameras = '[devices.cameras]\nkind = "gphoto2"\ngain = 1.0\nrelease_s = 0.5\n'
+    cameras += 'serials = { cam_00 = "usb:001,005" }\n'
+    text = SMALL.replace("[devices.cameras]\nport = 15021\nbusy_s = 900.0\n", cameras)
+    (path := tmp_path / "rig.toml").write_text(text)
+    assert load_rig_file(path).devices.cameras.lag_s == 0.5
+    path.write_text(text.replace("[devices]\n", "[devices]\nhardware_stepping = true\n"))
+    with pytest.raises(RigError, match=r"cannot fire cameras of gphoto2.* set it to false"):
         load_rig_file(path)

@@ -62,7 +62,7 @@ class Gphoto2Camera:
         self._files: deque[tuple[str, str]] = deque()  # folder and name of those on the camera
         self._count = 0
         self._trouble: Exception | None = None
-        self._lock = threading.RLock()  # a release may still be under way
+        self._lock = threading.RLock()
 
     @property
     def info(self) -> CameraInfo:
@@ -76,20 +76,19 @@ class Gphoto2Camera:
 
         Raises `DeviceError` where it refuses one, cannot be released over USB, or has no charge.
         """
-        with self._lock:
+        self._load()
+        with self._command("connecting"):
             self.close()
-            self._load()
             try:
-                with self._as_device_error("connecting"):
-                    self._find()
-                with self._as_device_error("setting up"):
-                    self._set_up("setting up")
-            except DeviceError:
+                self._find()
+                self._set_up("setting up")
+            except (DeviceError, self._failures):
                 self.close()
                 raise
 
     def close(self) -> None:
-        with self._lock:
+        """Close the link, unless a release that hangs keeps it for `timeout_s`."""
+        with suppress(DeviceTimeout), self._command("closing"):
             if self._camera is not None:
                 with suppress(self._failures):
                     self._camera.exit()
@@ -102,7 +101,7 @@ class Gphoto2Camera:
         """Expose at the next releases for `exposure` seconds, by a shutter speed of the camera's
         list, or by bulb from `BULB_S` on. Unread frames are deleted."""
         doing = f"arming for {exposure:g} s"
-        with self._lock, self._as_device_error(doing):
+        with self._command(doing):
             self._open(doing)
             self._end(doing)
             for name in ("imagequality", "imageformat"):
@@ -114,16 +113,15 @@ class Gphoto2Camera:
     def release(self) -> None:
         """Release the shutter. A busy camera makes no frame of this pulse."""
         doing = "releasing the shutter"
-        with self._lock:
-            try:
-                with self._as_device_error(doing):
-                    self._release(doing)
-            except Exception as error:  # raised by `read`
-                self._trouble = error
+        try:
+            with self._command(doing):
+                self._release(doing)
+        except Exception as error:  # raised by `read`
+            self._trouble = error
 
     def disarm(self) -> None:
         """Ignore releases from now on; unread frames are deleted."""
-        with self._lock, self._as_device_error("disarming"):
+        with self._command("disarming"):
             self._open("disarming")
             self._end("disarming")
 
@@ -131,7 +129,7 @@ class Gphoto2Camera:
         """The oldest unread frame. Raises `DeviceTimeout` where a release made no file within
         `frame_s`, and what `release` could not do."""
         doing = "reading a frame"
-        with self._lock, self._as_device_error(doing):
+        with self._command(doing):
             if self._trouble is not None:
                 error, self._trouble = self._trouble, None
                 raise error
@@ -356,16 +354,21 @@ class Gphoto2Camera:
             raise DeviceUnreachable(self.device, doing, "an open camera", "a closed one", todo)
 
     @contextmanager
-    def _as_device_error(self, doing: str) -> Iterator[None]:
-        """Turn the library's exceptions into `DeviceError`."""
+    def _command(self, doing: str) -> Iterator[None]:
+        """Turn the library's exceptions into `DeviceError`, and wait for another thread's release,
+        which may outlast a capture."""
+        limit = self.config.timeout_s
+        if not self._lock.acquire(timeout=limit):
+            expected, received = "the end of the last command", "a camera that hangs"
+            todo = "Switch it off and on, and start again."
+            raise DeviceTimeout(self.device, doing, expected, received, todo, limit)
         try:
             yield
         except self._failures as error:
             gp, code = self._gp, error.code
             if code == gp.GP_ERROR_CAMERA_BUSY:
                 todo = "Leave its menu and live view, and wait until it has written its card."
-                limit, received = self.config.timeout_s, "busy all the time"
-                expected = "a camera that is ready"
+                expected, received = "a camera that is ready", "busy all the time"
                 raise DeviceTimeout(self.device, doing, expected, received, todo, limit) from error
             if self._camera is not None and self._removed():
                 raise self._gone(doing) from error
@@ -374,6 +377,8 @@ class Gphoto2Camera:
             todo = "Check lens (manual focus), mode dial (M), mirror lock-up, card and cable."
             received = f"{error} ({self._condition() if self._camera else 'closed'})"
             raise self._error(doing, "libgphoto2 to carry it out", received, todo) from error
+        finally:
+            self._lock.release()
 
     def _full(self, doing: str) -> DeviceError:
         todo = "Empty the card; frames that were read are in the capture, which can be resumed."
