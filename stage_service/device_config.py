@@ -272,9 +272,11 @@ class AravisConfig(GenicamConfig):
 class Gphoto2Config(NumberedCamerasConfig):
     """`[devices.cameras]`: DSLRs and mirrorless cameras on USB, through libgphoto2.
 
-    `serials` may have a USB port, "usb:001,005". `settings` are written to the camera in their
-    order. The shutter is open within `release_s` of the release, while the lamps are already on.
-    `jpeg`: frames are JPEG, by the sRGB curve, not RAW. `keep` leaves the files on the card.
+    `serials` maps each camera of the rig file to its serial number or USB port, "usb:001,005".
+    `gain`, counts per (W/(sr m²) · s), is calibrated. `settings` are written to the camera in their
+    order. The lamps are on for `release_s`, within which the shutter opens, and the exposure; its
+    file comes within `frame_s`. `jpeg`: frames are JPEG, by the sRGB curve, not RAW. `keep` leaves
+    the files on the card.
     """
 
     kind: Literal["gphoto2"]

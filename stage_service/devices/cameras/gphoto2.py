@@ -169,7 +169,7 @@ class Gphoto2Camera:
                     seen.append(f"{model} {_SERIALS[port]} at {port}")
         expected = f"a camera with serial number or port {self.serial}"
         todo = "Check power, cable and serials in [devices.cameras]; close programs that hold "
-        todo += "cameras, such as gvfs-gphoto2-volume-monitor."
+        todo += "cameras, such as gvfs-gphoto2-volume-monitor; install the rules of deploy/udev."
         received = ", ".join(seen) or "no camera at all"
         raise DeviceUnreachable(self.device, "connecting", expected, received, todo)
 

@@ -42,8 +42,12 @@ def _raw(data: bytes) -> NDArray[np.uint16]:
     if not (mosaic.black < mosaic.white).all():
         raise ValueError(f"black levels {mosaic.black} and white levels {mosaic.white}")
     scale = (FULL - BLACK) / (mosaic.white - mosaic.black)
-    values = (mosaic.values - mosaic.black[mosaic.sites]) * scale[mosaic.sites]
-    return pixel_formats.rgb(_whole(values), f"Bayer{mosaic.bayer[:2]}16")
+    scaled = np.empty_like(mosaic.values)
+    for y, x in np.ndindex(2, 2):
+        site = mosaic.sites[y, x]
+        table = _whole((np.arange(1 << 16) - mosaic.black[site]) * scale[site])
+        scaled[y::2, x::2] = table[mosaic.values[y::2, x::2]]
+    return pixel_formats.rgb(scaled, f"Bayer{mosaic.bayer[:2]}16")
 
 
 def _jpeg(data: bytes) -> NDArray[np.uint16]:
