@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dslrs import Body, FakeGphoto2, jpeg
+from waiting import until
 
 from reconstruction import Capture, CaptureWriter, verify
 from stage_service.acquisition.sequencer import Sequencer
@@ -165,3 +167,22 @@ def test_the_trigger_box_cannot_clock_them(dslrs, tmp_path):
     rig_file, _ = dslrs
     with pytest.raises(PlanError, match="stepping"):
         planned(rig_file, stepping="hardware")
+
+
+def test_an_abort_does_not_wait_for_a_camera_that_hangs(dslrs, world, tmp_path, slack):
+    rig_file, bodies = dslrs
+    bodies[1].lag_s, bodies[1].blocks = 2.0 * slack, True
+    cameras = rig_file.devices.cameras.model_copy(update={"timeout_s": 0.1})
+    rig_file = replace(rig_file, devices=rig_file.devices.model_copy(update={"cameras": cameras}))
+    plan = planned(rig_file, sentinels=False)
+    writer = CaptureWriter.create(tmp_path / "c", rig_file.rig, {"steps": plan.steps})
+    capturing = run(rig_file, writer, plan)
+    ended = threading.Thread(target=capturing.run)
+    ended.start()
+    until(lambda: bodies[1].releases)
+    began = time.monotonic()
+    capturing.stop_now()
+    ended.join()
+    assert time.monotonic() - began < 1.5 * slack
+    assert capturing.outcome == "aborted"
+    assert not world.lit
