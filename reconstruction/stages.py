@@ -59,12 +59,16 @@ class MeasuringStages(Stages):
     """The stages that measure."""
 
     def imported(self, capture: Capture) -> None:
-        """The notes of the import, if the capture was imported."""
+        """The notes of the import, if the capture was imported, and the motion taken off it."""
         if notes := capture.plan.get("import"):
             with self.report.stage("import") as stage:
                 stage.figures["relative_units"] = bool(notes["relative"])
                 for note in notes["notes"]:
                     stage.warn(note)
+
+        if motion := capture.plan.get("stabilised"):
+            with self.report.stage("stabilised") as stage:
+                stage.figures |= {k: v for k, v in motion.items() if k != "motion"}
 
     def undistorted(self, capture: Capture) -> Capture:
         """The capture through pinholes; the stage "lenses" has the share of pixels kept."""

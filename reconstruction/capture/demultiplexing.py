@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from reconstruction.arrays import Array, Bools, Floats
+from reconstruction.capture.derived import copy_frame, derived
 from reconstruction.capture.folder import Capture
 from reconstruction.capture.light_patterns import Demultiplexing
 from reconstruction.capture.records import CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
-from reconstruction.files.durable import write_whole
-from reconstruction.files.exr import read_exr
 from reconstruction.report.report import Progress, silent
 
 MEMORY = 1 << 30
@@ -70,22 +68,12 @@ def demultiplex(source: Capture, out: Path, progress: Progress = silent) -> Demu
     plan = {k: v for k, v in source.plan.items() if k != "patterns"}
     plan |= {"steps": [*others, *steps.values()], "demultiplexed": record}
     cameras = [c.name for c in source.rig.cameras]
-    masks, subjects = (
-        {c: m for c in cameras if (m := read(c)) is not None}
-        for read in (source.mask, source.subject)
-    )
-    writer = CaptureWriter.create(
-        out, source.rig, plan, masks=masks, subjects=subjects, head=source.head
-    )
     misfits, notes = [], list(whole.warnings())
-    try:
-        scalp = source.path / "scalp.obj"
-        if scalp.is_file():
-            write_whole(out / "scalp.obj", scalp.read_bytes())
+    with derived(source, out, source.rig, plan, "demultiplexed_from") as writer:
         for k, camera in enumerate(cameras):
             progress("demultiplexing", k / len(cameras))
             for step in others:
-                _copy(source, step, camera, writer)
+                copy_frame(source, step, camera, writer)
             there = [n for n in names if source.has_light(n, camera)]
             solution = Demultiplexing(patterns.rows(there))
             if not there or not solution.spans:
@@ -98,24 +86,8 @@ def demultiplex(source: Capture, out: Path, progress: Progress = silent) -> Demu
                 solution, misfit = _weighted(source, camera, there, solution)
                 misfits.append(misfit)
             _write(source, camera, there, solution.matrix, steps, writer)
-        writer.finish("completed", {"demultiplexed_from": source.path.name})
-    except BaseException:
-        writer.close()
-        shutil.rmtree(out)
-        raise
     off = float(np.sqrt(np.mean(np.square(misfits)))) if misfits else None
     return Demultiplexed(Capture(out), whole, off, tuple(notes))
-
-
-def _copy(source: Capture, step: Step, camera: str, writer: CaptureWriter) -> None:
-    if not source.has(step, camera):
-        writer.record_missing(step, camera, reason="missing in the capture of patterns")
-        return
-    image, attributes = source.read_file(step, camera, read_exr)
-    full, count = (
-        float(attributes.get(k, v)) for k, v in (("fullScale", np.inf), ("countScale", 0))
-    )
-    writer.write_frame(step, camera, image, full_scale=full, count_scale=count)
 
 
 def _weighted(

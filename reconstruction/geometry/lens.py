@@ -46,17 +46,8 @@ class Lens:
         return cls(bent, straight, _grid(straight, bent), _grid(bent, straight))
 
     def undistort(self, image: Floats) -> Floats:
-        """An image `(H, W, C)` as shot, undistorted, by cubic interpolation.
-
-        Negative values are clamped to the least of the four pixels around: a cubic's undershoot at
-        an edge would count as noise.
-        """
-        x, y = self.to_shot
-        image = np.ascontiguousarray(image, dtype=np.float32)
-        out = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        least = cv2.erode(image, np.ones((2, 2), np.uint8), anchor=(1, 1))  # of these and before
-        least = cv2.remap(least, np.ceil(x), np.ceil(y), cv2.INTER_NEAREST)
-        return np.maximum(out, np.minimum(least, 0)).reshape(*x.shape, -1)
+        """An image `(H, W, C)` as shot, undistorted: `resampled`."""
+        return resampled(image, self.to_shot)
 
     def undistort_mask(self, mask: Bools) -> Bools:
         """A mask `(H, W)` in the pixels as shot, in the undistorted ones."""
@@ -64,7 +55,7 @@ class Lens:
 
     def undistort_any(self, mask: Bools) -> Bools:
         """Undistorted pixels `(H, W)` that any marked pixel of the shot `mask` goes into."""
-        return np.asarray(_weight(mask, self.to_shot) > 0)
+        return any_resampled(mask, self.to_shot)
 
     def distort_mask(self, mask: Bools) -> Bools:
         """The inverse of `undistort_mask`: a mask `(H, W)` as the lens shows it."""
@@ -74,6 +65,25 @@ class Lens:
         """The share of the shot image's pixels inside the undistorted one."""
         pixels = np.stack(self.to_undistorted, axis=-1)
         return float(self.undistorted.inside(pixels).mean())
+
+
+def resampled(image: Floats, maps: Maps) -> Floats:
+    """An image `(H, W, C)` at the coordinates `maps`, by cubic interpolation.
+
+    Negative values are clamped to the least of the four pixels around: a cubic's undershoot at an
+    edge would count as noise.
+    """
+    x, y = maps
+    image = np.ascontiguousarray(image, dtype=np.float32)
+    out = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    least = cv2.erode(image, np.ones((2, 2), np.uint8), anchor=(1, 1))  # of these and before
+    least = cv2.remap(least, np.ceil(x), np.ceil(y), cv2.INTER_NEAREST)
+    return np.maximum(out, np.minimum(least, 0)).reshape(*x.shape, -1)
+
+
+def any_resampled(mask: Bools, maps: Maps) -> Bools:
+    """Pixels at the coordinates `maps` that any marked pixel of `mask (H, W)` goes into."""
+    return np.asarray(_weight(mask, maps) > 0)
 
 
 def _moved(source: Camera, target: Camera, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:

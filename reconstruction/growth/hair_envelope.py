@@ -18,8 +18,7 @@ from reconstruction.geometry.mesh_queries import (
     mesh_silhouette,
 )
 from reconstruction.geometry.voxels import VoxelGrid
-from reconstruction.head.lit_skin import first_depth
-from reconstruction.images.visual_hull import space_carve, trim_edges, visual_hull
+from reconstruction.images.visual_hull import first_depth, space_carve, trim_edges, visual_hull
 from reconstruction.light_planes import PointCloud
 from reconstruction.masks import MaskedCapture
 from reconstruction.plausibility import check_places, check_subject, check_volume

@@ -18,14 +18,10 @@ from reconstruction.geometry.placement import to_z_up
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.head.fit import HeadFit, HeadFitError, HeadHints, fit_head
 from reconstruction.head.generic import generic_head
-from reconstruction.head.lit_skin import (
-    FEWEST_LIGHTS,
-    FEWEST_PIXELS,
-    first_depth,
-    lit_skin,
-)
+from reconstruction.head.lit_skin import FEWEST_LIGHTS, FEWEST_PIXELS, lit_skin
 from reconstruction.head.scalp_map import ScalpMap
 from reconstruction.head.template import template
+from reconstruction.images.visual_hull import first_depth
 from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.mask_geometry import distance_to
 from reconstruction.masks import MaskedCapture

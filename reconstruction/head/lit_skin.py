@@ -18,6 +18,7 @@ from reconstruction.capture.folder import Capture
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.grey import grey
+from reconstruction.images.visual_hull import first_depth, surface_points
 
 FEWEST_LIGHTS, MOST_LIGHTS = 24, 110
 """Least number of lights for a normal, and about the most that are read."""
@@ -58,7 +59,7 @@ def lit_skin(
     whole, camera = camera, camera.reduced(by)
     skin = _blocks(skin, by).min(axis=(1, 3))
     first = first_depth(camera, hull)
-    heights = _points(camera, np.where(np.isfinite(first), first, 0))[..., 2]
+    heights = surface_points(camera, np.where(np.isfinite(first), first, 0))[..., 2]
     skin = _largest(skin & np.isfinite(first) & (heights > lowest))
     if skin.sum() < FEWEST_PIXELS:
         return None
@@ -72,7 +73,7 @@ def lit_skin(
     places = np.stack([light.position for light in lights])
     depth = surface = first[skin]
     for _ in range(_ROUNDS):
-        points = _points(camera, _image(skin, depth))[skin]
+        points = surface_points(camera, _image(skin, depth))[skin]
         normals = matte_normals(values, places - points[:, None], known > 0)
         log_depth, piece = integrated(camera, skin, normals)
         nearest = np.bincount(piece).argmax() == piece
@@ -80,7 +81,7 @@ def lit_skin(
         depth = np.where(nearest, np.exp(log_depth + scale), surface)
     if nearest.sum() < FEWEST_PIXELS:
         return None
-    points = _points(camera, _image(skin, depth))[skin]
+    points = surface_points(camera, _image(skin, depth))[skin]
     return LitSkin(points[nearest], normals[nearest], whole.name)
 
 
@@ -140,28 +141,6 @@ def integrated(camera: Camera, region: Bools, normals: Array) -> tuple[Array, Ar
     normal = (system.T @ system + 1e-9 * sparse.eye_array(len(y))).tocsc()
     log_depth = np.asarray(spsolve(normal, system.T @ np.concatenate(wanted)))
     return log_depth, np.asarray(connected_components(normal, directed=False)[1])
-
-
-def first_depth(camera: Camera, hull: VoxelGrid) -> Array:
-    """Depth `(H, W)` of the hull's nearest voxel along z, metres, infinite without one.
-
-    In squares of pixels as wide as a voxel, since finer pixels miss voxel centres.
-    """
-    centers = hull.centers()
-    inside, x, y, depth = camera.pixels_of(centers)
-    size = hull.spacing * camera.K[0, 0] / float(np.median(depth)) if len(depth) else 1.0
-    square = max(1, int(np.ceil(size)))
-    first = np.full((camera.height // square + 1, camera.width // square + 1), np.inf)
-    np.minimum.at(first, (y[inside] // square, x[inside] // square), depth[inside])
-    rows, columns = (np.arange(n) // square for n in (camera.height, camera.width))
-    return np.asarray(first[np.ix_(rows, columns)])
-
-
-def _points(camera: Camera, depth: Array) -> Array:
-    """World positions `(H, W, 3)` at `depth (H, W)` along z."""
-    grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    rays = camera.rays(grid)
-    return np.asarray(camera.center + rays * (depth / (rays @ camera.R[2]))[..., None])
 
 
 def _image(region: Bools, values: Array) -> Array:

@@ -224,6 +224,28 @@ def trim_edges(mask: Bools, hair: Bools) -> Bools:
     return out
 
 
+def first_depth(camera: Camera, hull: VoxelGrid) -> Array:
+    """Depth `(H, W)` of the hull's nearest voxel along z, metres, infinite without one.
+
+    In squares of pixels as wide as a voxel, since finer pixels miss voxel centres.
+    """
+    centers = hull.centers()
+    inside, x, y, depth = camera.pixels_of(centers)
+    size = hull.spacing * camera.K[0, 0] / float(np.median(depth)) if len(depth) else 1.0
+    square = max(1, int(np.ceil(size)))
+    first = np.full((camera.height // square + 1, camera.width // square + 1), np.inf)
+    np.minimum.at(first, (y[inside] // square, x[inside] // square), depth[inside])
+    rows, columns = (np.arange(n) // square for n in (camera.height, camera.width))
+    return np.asarray(first[np.ix_(rows, columns)])
+
+
+def surface_points(camera: Camera, depth: Array) -> Array:
+    """World positions `(H, W, 3)` at `depth (H, W)` along z."""
+    grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    rays = camera.rays(grid)
+    return np.asarray(camera.center + rays * (depth / (rays @ camera.R[2]))[..., None])
+
+
 def space_carve(
     hull: VoxelGrid,
     cameras: Sequence[Camera],

@@ -8,6 +8,7 @@ tracking frame before, whichever correlates better.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -45,7 +46,7 @@ STILL: Pose = (np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
-class _TrackedView:
+class TrackedView:
     """One camera's reference image, prepared, and its points."""
 
     camera: Camera
@@ -71,32 +72,35 @@ class _TrackedView:
 
 def solve_motion(
     capture: Capture,
-    points: PointCloud,
+    points: PointCloud | Mapping[str, Array],
     *,
+    lit: Sequence[Step] | None = None,
     options: MotionOptions | None = None,
     progress: Progress = silent,
     stage: Stage | None = None,
 ) -> Motion:
     """Rigid motion from the first tracking frame (the reference pose) to each of the others.
 
-    `points` is a cloud without motion compensation. A capture without tracking frames, or a subject
+    `points` is a cloud without motion compensation, or `(N, 3)` by camera; `lit` are steps to use
+    instead of the tracking frames. A capture without tracking frames, or a subject
     that kept still, gives `Motion.still`. Directions of motion that the cameras do not determine
     stay zero, with a warning in `stage`. Frames below `ALIKE` are `Motion.lost`, with a warning.
     """
     options, stage = options or MotionOptions(), stage or Stage("motion")
-    steps = [
-        s for s in capture.of_kind("tracking") if any(capture.has(s, c) for c in points.cameras)
-    ]
+    if isinstance(points, PointCloud):
+        points = {name: points.of_camera(name).points for name in points.cameras}
+    lit = capture.of_kind("tracking") if lit is None else lit
+    steps = [s for s in lit if any(capture.has(s, c) for c in points)]
     if len(steps) < 2:
         stage.leave_out("motion solve", f"{len(steps)} tracking frames", "the whole stage")
         return Motion.none([s.index for s in steps])
-    views = _views(capture, steps[0], points, stage)
+    views = tracked_views(capture, steps[0], points, stage)
     if not views:
         stage.warn("no camera could be registered: the subject is assumed to be still")
         return Motion.none([s.index for s in steps])
     largest, moved = 0.0, False
     for step in steps[1:]:
-        present, images = _present(capture, step, views)
+        present, images = present_views(capture, step, views)
         quick = [v.template.register(images[v.camera.name], iterations=1) for v in present]
         largest = max([largest, *(r.largest() for r in quick)])
         moved |= _moved(quick)
@@ -116,7 +120,7 @@ def solve_motion(
 def _solve_all(
     capture: Capture,
     steps: list[Step],
-    views: list[_TrackedView],
+    views: list[TrackedView],
     options: MotionOptions,
     progress: Progress,
     stage: Stage,
@@ -125,7 +129,7 @@ def _solve_all(
     kept, lost = [steps[0].index], []
     for i, step in enumerate(steps[1:]):
         progress("motion", i / (len(steps) - 1))
-        present, images = _present(capture, step, views)
+        present, images = present_views(capture, step, views)
         if not present:
             continue
         found = [(v, v.template.register(images[v.camera.name], iterations=15)) for v in present]
@@ -145,7 +149,7 @@ def _solve_all(
     if lost:
         stage.warn(
             f"{len(lost)} of {len(steps)} tracking frames (the first is step {lost[0]}) could not "
-            "be aligned: the subject moved too far or was hidden. The stripes between them and "
+            "be aligned: the subject moved too far or was hidden. The frames between them and "
             "their neighbours are ignored"
         )
         stage.figures["lost_frames"] = len(lost)
@@ -184,7 +188,7 @@ def _solve_all(
 
 
 def from_registrations(
-    found: list[tuple[_TrackedView, Registration]],
+    found: list[tuple[TrackedView, Registration]],
 ) -> tuple[Pose, Determination, float]:
     """The motion that best explains 2D registrations (Photobooth Eq. 2), robustly.
 
@@ -210,7 +214,7 @@ def from_registrations(
 
 
 def align(
-    views: list[_TrackedView], images: dict[str, Array], start: Pose
+    views: list[TrackedView], images: dict[str, Array], start: Pose
 ) -> tuple[Pose, Determination]:
     """The motion under which every camera's image `(H, W)` at the moved points equals its
     reference, and its determination."""
@@ -238,7 +242,7 @@ def align(
     return gauss_newton(system, 10, start)
 
 
-def likeness(views: list[_TrackedView], images: dict[str, Array], pose: Pose) -> float:
+def likeness(views: list[TrackedView], images: dict[str, Array], pose: Pose) -> float:
     """Correlation of `images (H, W)` at the moved points with the reference, median over cameras.
 
     Times the share of the points inside the image.
@@ -259,25 +263,26 @@ def likeness(views: list[_TrackedView], images: dict[str, Array], pose: Pose) ->
     return float(np.median(out))
 
 
-def _views(
-    capture: Capture, reference: Step, points: PointCloud, stage: Stage
-) -> list[_TrackedView]:
+def tracked_views(
+    capture: Capture, reference: Step, points: Mapping[str, Array], stage: Stage
+) -> list[TrackedView]:
+    """The cameras that can be registered, by `points (N, 3)` of each; warns of the others."""
     rng = np.random.default_rng(0)
     views = []
     for camera in capture.rig.cameras:
         if not capture.has(reference, camera.name):
             stage.warn(f"{camera.name} has no reference tracking frame and is not used")
             continue
-        own = points.of_camera(camera.name).points
+        own = points.get(camera.name, np.zeros((0, 3)))
         pixels, depth = camera.project(own)
         own = own[(depth > 0) & camera.inside(pixels)]
         if len(own) < 30:
-            stage.warn(f"{camera.name} triangulated {len(own)} points: not used for motion")
+            stage.warn(f"{camera.name} has {len(own)} points: not used for motion")
             continue
         if len(own) > MOST_POINTS:
             own = own[np.sort(rng.choice(len(own), MOST_POINTS, replace=False))]
         pixels = camera.project(own)[0]
-        image = _picture(capture, reference, camera.name)
+        image = tracking_image(capture, reference, camera.name)
         mask = np.zeros(image.shape, bool)
         mask[tuple(np.rint(pixels[:, ::-1]).astype(int).T)] = True
         # includes the contour against the dark background, the strongest feature
@@ -288,23 +293,23 @@ def _views(
         except ValueError as error:
             stage.warn(f"{camera.name} is not used for motion: {error}")
             continue
-        views.append(_TrackedView(camera, template, own, pixels))
+        views.append(TrackedView(camera, template, own, pixels))
     return views
 
 
-def _picture(capture: Capture, step: Step, camera: str) -> Array:
+def tracking_image(capture: Capture, step: Step, camera: str) -> Array:
     """The square root of the radiance: photon noise is then uniform."""
     dark = dark_frame(capture, camera, step.exposure)
     image = capture.frame(step, camera).mean(axis=-1) - dark
     return np.asarray(np.sqrt(np.maximum(image, 0) / (step.level or 1.0)), np.float64)
 
 
-def _present(
-    capture: Capture, step: Step, views: list[_TrackedView]
-) -> tuple[list[_TrackedView], dict[str, Array]]:
+def present_views(
+    capture: Capture, step: Step, views: list[TrackedView]
+) -> tuple[list[TrackedView], dict[str, Array]]:
     """The views that have a frame of this step, and the images."""
     present = [v for v in views if capture.has(step, v.camera.name)]
-    return present, {v.camera.name: _picture(capture, step, v.camera.name) for v in present}
+    return present, {v.camera.name: tracking_image(capture, step, v.camera.name) for v in present}
 
 
 def _moved(frame: list[Registration]) -> bool:

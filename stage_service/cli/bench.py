@@ -30,6 +30,7 @@ BENCHMARKS = {
     "light_codes": "line stereo with and without lightcodes, and fused, on patches of two heads",
     "light_planes": "strands of three subjects, still and drifting, compared with baselines",
     "masks": "automatic hair masks compared with true ones, at several path counts",
+    "motion": "single lights of a moving subject, stabilised by lit frames, compared with still",
     "patterns": "patterns of lights compared with single lights, at equal exposure time",
     "pixels": "strands of patches of fine hair at pixels of 1.8 to 0.25 mm, with baselines",
     "publish-set": "captures with true strands in open formats, with a scorer; read back, scored",

@@ -1,4 +1,4 @@
-"""`verify`, `import` and `demultiplex`: capture folders on disk."""
+"""`verify`, `import`, `demultiplex` and `stabilise`: capture folders on disk."""
 
 from __future__ import annotations
 
@@ -82,6 +82,10 @@ def add(commands: Commands) -> None:
     single.add_argument("capture", type=Path, help="the capture of patterns of lights")
     single.add_argument("--out", type=Path, required=True, help="new capture folder")
 
+    steady = add_command(commands, "stabilise", run_stabilise, interrupted=remains)
+    steady.add_argument("capture", type=Path, help="the capture of a subject that moved")
+    steady.add_argument("--out", type=Path, required=True, help="new capture folder")
+
 
 def run_verify(args: argparse.Namespace, output: Output) -> int:
     """Read a capture again and list its damaged files.
@@ -109,6 +113,7 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.images.faint_parts import faint_warnings
     from reconstruction.images.import_targets import find_targets
     from reconstruction.images.scene_checks import check_scene
+    from reconstruction.light_planes.stabilising import lit_frames
 
     if args.targets and not args.dry_run:
         raise BadArgument("--targets needs --dry-run: it only proposes lines for import.toml")
@@ -137,6 +142,11 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         capture = understood.write(args.out, progress)
         progress("comparing light positions with images", 1.0)
         doubts = [*check_scene(capture), *faint_warnings(capture)]
+    if (lit := len(lit_frames(capture))) > 1:
+        doubts.append(
+            f"{lit} fully lit frames lie among the single lights: if the subject moved, "
+            f"'hairstage stabilise {args.out} --out NEW' takes its motion off"
+        )
     for note in doubts:
         output.note(note)
     counts = {
@@ -176,6 +186,24 @@ def run_demultiplex(args: argparse.Namespace, output: Output) -> None:
         lines.append(f"frames differ from the sums by {found.misfit:.2%}")
     data = {"condition": solution.condition, "misfit": found.misfit, "notes": found.notes, **gains}
     output.result({"capture": str(args.out), **data}, "\n".join(lines))
+
+
+def run_stabilise(args: argparse.Namespace, output: Output) -> None:
+    """Take a subject's motion off single lights, by the fully lit frames among them.
+
+    Prints the motion and its estimated error. Nothing is written if the subject kept still.
+    """
+    from reconstruction import Capture
+    from reconstruction.capture.writer import require_vacant
+    from reconstruction.light_planes.stabilising import stabilise
+
+    require_vacant(args.out)
+    with progress_bar("stabilise") as progress:
+        found = stabilise(Capture(args.capture), args.out, progress)
+    for note in found.warnings:
+        output.note(f"warning: {note}")
+    data = {**found.figures, "summary": found.summary, "warnings": found.warnings}
+    output.result({"capture": str(found.capture.path), **data}, found.summary)
 
 
 def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:

@@ -48,6 +48,8 @@ class CapturePlan(Strict):
     all at the next, so that cameras are armed once for each. `rate_hz` limits the steps per second.
     `stepping`: the service or the trigger box clocks the steps; "auto" prefers the box. `consent`
     records who agreed, when, and to what, if a living subject sees flashes of 3 to 30 Hz.
+    A fully lit frame precedes every `lit_every` lights and follows the last one, for
+    `hairstage stabilise`; 0: none.
 
     In the sweep a tracking frame precedes every full group of `tracking_every` scanlines of a
     projector, floor(rows / tracking_every) times and at least once: 76 for 768 rows. The remaining
@@ -59,6 +61,7 @@ class CapturePlan(Strict):
     rows: Rows = Rows()
     sentinels: bool = True
     brackets: Annotated[tuple[Bracket, ...], Field(min_length=1, max_length=8)] = (1.0,)
+    lit_every: Annotated[int, Field(ge=0, le=MOST_ROWS)] = 0
     stepping: Literal["auto", "software", "hardware"] = "auto"
     rate_hz: Annotated[float, Field(ge=0.01, le=1000.0)] | None = None
     consent: Annotated[str, Text, Field(min_length=12, max_length=2000), LINES] | None = None

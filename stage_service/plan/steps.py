@@ -16,11 +16,13 @@ def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
     ends = [{"kind": "dark"}, {"kind": "all_on"}] if plan.sentinels else []
     names = [x.name for x in rig_file.rig.lights] if plan.lights == "all" else plan.lights
     todo: list[dict[str, Any]] = [*ends]
-    todo += [
-        {"kind": "olat", "light": name, "exposure": exposures.olat * factor}
-        for factor in plan.brackets
-        for name in names
-    ]
+    for factor in plan.brackets:
+        for i, name in enumerate(names):
+            if plan.lit_every and i % plan.lit_every == 0:
+                todo.append({"kind": "all_on"})
+            todo.append({"kind": "olat", "light": name, "exposure": exposures.olat * factor})
+    if plan.lit_every and names:
+        todo.append({"kind": "all_on"})
     every = defaults.tracking_every if plan.tracking_every is None else plan.tracking_every
     for projector in swept(plan, rig_file):
         rows = rows_of(plan.rows, projector)

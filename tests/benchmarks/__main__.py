@@ -37,6 +37,7 @@ MODULES = {
     "light_codes": "benchmarks.light_codes.patches",
     "light_planes": "benchmarks.light_planes.subjects",
     "masks": "benchmarks.light_planes.masks",
+    "motion": "benchmarks.appearance.motion",
     "patterns": "benchmarks.appearance.patterns",
     "pixels": "benchmarks.pixels.study",
     "publish-set": "benchmarks.publishing.published_set",

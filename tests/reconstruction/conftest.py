@@ -190,3 +190,9 @@ def stage_camera() -> Callable[..., Camera]:
 def stage_projector() -> Callable[..., Projector]:
     """Makes a projector of the sphere's stage: name, azimuth and roll in degrees."""
     return projector
+
+
+@pytest.fixture(scope="session")
+def look_at_sphere() -> Callable[..., tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    """Casts a camera's rays at the sphere."""
+    return look

@@ -45,6 +45,14 @@ def test_a_tracking_frame_stands_before_each_full_group_of_ten(demo):
     assert rows_after == [0, 10, 20, 30, 40, 50]
 
 
+def test_lit_frames_stand_among_single_lights_and_after_them(demo):
+    plan = CapturePlan(lights=("light_000", "light_001", "light_002"), sentinels=False,
+                       projectors=(), lit_every=2, brackets=(1.0, 4.0))  # fmt: skip
+    kinds = [s.kind for s in resolve(plan, demo).steps]
+    bracket = ["all_on", "olat", "olat", "all_on", "olat"]
+    assert kinds == [*bracket, *bracket, "all_on"]
+
+
 def test_photobooth_counts_as_in_the_paper(stage331):
     rig = stage331.rig
     sixteen = replace(stage331, rig=Rig("booth", rig.cameras[:16], (), rig.projectors))

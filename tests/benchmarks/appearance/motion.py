@@ -1,0 +1,258 @@
+"""Single lights of a subject that moves, stabilised by the lit frames among them, and still.
+
+A small stage renders each step in the pose of its time: a drift by so many millimetres and degrees
+over the capture, or a jump. Errors of the motion; of a single light's picture beside that of the
+still subject; of a left-out light by the three nearest ones; of strands and their directions.
+Leaves `motion.json` and `motion.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from appearance import render_olat
+from appearance.model.baselines import three_nearest
+from benchmarks.command import SUBJECT, Benchmark, option
+from benchmarks.results import markdown, save, spread
+from benchmarks.strand_truth import StrandTruth, write_hair_masks
+from benchmarks.subjects import Subject, simulated
+from reconstruction import (
+    Camera,
+    Capture,
+    CaptureWriter,
+    Light,
+    Model,
+    Progress,
+    ReconstructOptions,
+    Rig,
+    Step,
+    reconstruct,
+    write_strands,
+)
+from reconstruction.arrays import Array
+from reconstruction.geometry.lights import dome_positions
+from reconstruction.light_planes.stabilising import stabilise
+
+SEEDS = option("--seeds", "how many subjects, from --seed on", type=int, default=2)
+DRIFTS = {"2 mm, 1°": (2e-3, 1.0), "5 mm, 2°": (5e-3, 2.0), "10 mm, 3°": (10e-3, 3.0)}
+JUMP = (5e-3, 2.0)
+TOGETHER = 3
+Poses = Callable[[float], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Size:
+    """Pixels across, cameras, lights, single lights from a lit frame to the next, paths a pixel."""
+
+    pixels: int = 128
+    cameras: int = 6
+    lights: int = 60
+    every: int = 12
+    spp: int = 8
+
+
+def drift(shift: float, turn_deg: float, seed: int, jump_at: float | None = None) -> Poses:
+    """The pose at a share 0 to 1 of the capture: smooth, or at once at `jump_at`."""
+    rng = np.random.default_rng([seed, 11])
+    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    bend = rng.normal(size=3) * 0.25
+
+    def pose(time: float) -> tuple[Array, Array]:
+        far = float(time >= jump_at) if jump_at is not None else time
+        curve = 0.0 if jump_at is not None else float(np.sin(2 * np.pi * time))
+        turn = Rotation.from_rotvec(np.radians(turn_deg) * (far * axis + 0.5 * curve * bend))
+        return turn.as_matrix(), shift * (far * way + curve * bend)
+
+    return pose
+
+
+def stage(size: Size, subject: Subject) -> Rig:
+    """Cameras around the subject's middle, and a dome of lights."""
+    low, high = (f(subject.strands.points, axis=0).astype(float) for f in (np.min, np.max))
+    middle, reach = 0.5 * (low + high), 0.62 * float((high - low).max())
+    cameras = [
+        Camera.look_at(
+            f"cam_{k:02d}", size.pixels, size.pixels, place + middle, middle,
+            float(np.degrees(2 * np.arctan(reach / 0.95))),
+        )
+        for k, place in enumerate(dome_positions(size.cameras, 0.95, 0.0))
+    ]  # fmt: skip
+    places = dome_positions(size.lights, 1.2, lowest_deg=-30)
+    order = np.random.default_rng(0).permutation(size.lights)  # neighbours at other times
+    lights = [Light(f"light_{k:02d}", places[i], np.full(3, 8.0)) for k, i in enumerate(order)]
+    return Rig("moving", tuple(cameras), tuple(lights))
+
+
+def plan(size: Size) -> list[Step]:
+    """A lit frame before every `every` single lights, and at the end."""
+    kinds: list[dict[str, Any]] = []
+    for k in range(size.lights):
+        kinds += [{"kind": "all_on"}] * (k % size.every == 0)
+        kinds.append({"kind": "olat", "light": f"light_{k:02d}"})
+    kinds.append({"kind": "all_on"})
+    return [Step(i, exposure=0.02, **k) for i, k in enumerate(kinds)]
+
+
+def groups(steps: list[Step]) -> list[list[Step]]:
+    """Up to `TOGETHER` consecutive single lights, or a lit frame; rendered together in one pose."""
+    out: list[list[Step]] = []
+    for step in steps:
+        new = step.light is None or not out or out[-1][0].light is None
+        if new or len(out[-1]) == TOGETHER:
+            out.append([])
+        out[-1].append(step)
+    return out
+
+
+def time_of(steps: list[Step], index: int) -> float:
+    """The share 0 to 1 of the capture at which a step is shot, with its group's middle."""
+    group = next(g for g in groups(steps) if index in [s.index for s in g])
+    return float(np.mean([s.index for s in group])) / (len(steps) - 1)
+
+
+def shoot(path: Path, subject: Subject, size: Size, pose: Poses, seed: int) -> Capture:
+    """Render the capture `path`: the stage moves the other way around the still subject."""
+    shutil.rmtree(path, ignore_errors=True)
+    rig, steps, scene = stage(size, subject), plan(size), subject.scene()
+    writer = CaptureWriter.create(path, rig, {"steps": steps}, head=subject.head)
+    records = []
+    for group in groups(steps):
+        turn, shift = pose(time_of(steps, group[0].index))
+        names = [s.light for s in group]
+        lights = [x.moved(turn, shift) for x in rig.lights if None in names or x.name in names]
+        for k, camera in enumerate(rig.cameras):
+            stream = (seed * 1000 + group[0].index) * 100 + k
+            images = render_olat(
+                scene, camera.moved(turn, shift), lights, spp=size.spp, max_depth=1, seed=stream
+            )
+            if None in names:
+                images = images.sum(axis=0, keepdims=True)
+            records += [
+                writer.store_frame(s, camera.name, x) for s, x in zip(group, images, strict=True)
+            ]
+    writer.commit(records)
+    writer.finish("completed")
+    return Capture(path)
+
+
+def motion_errors(found: Any, pose: Poses, steps: list[Step], points: Array) -> dict[str, float]:
+    """Root mean square errors at `points (N, 3)` and of turns, over all single lights."""
+    singles = [s.index for s in steps if s.light is not None]
+    metres, turns = [], []
+    for k, turn, shift in zip(singles, *found.at(singles), strict=True):
+        R, t = pose(time_of(steps, k))
+        metres.append(((points @ (turn - R).T + shift - t) ** 2).sum(axis=1).mean())
+        turns.append(np.linalg.norm(Rotation.from_matrix(turn @ R.T).as_rotvec()))
+    mm, deg = 1e3 * np.sqrt(np.mean(metres)), np.degrees(np.sqrt(np.mean(np.square(turns))))
+    return {"motion mm": float(mm), "motion °": float(deg)}
+
+
+def picture_errors(capture: Capture, still: Capture, hair: dict[str, Array]) -> dict[str, float]:
+    """Relative errors, root mean square over the hair, of frames and of left-out lights by their
+    three nearest ones, beside the frames of the still subject."""
+    lights = capture.olat_lights()
+    off, left, size = np.zeros(3)
+    for camera, mask in hair.items():
+        for name in lights[::6]:
+            true = still.light(name, camera)[0][mask].astype(float)
+            guess = three_nearest(capture, camera, still.rig.light(name), lights)[mask]
+            off += float(np.square(capture.light(name, camera)[0][mask] - true).sum())
+            left += float(np.square(guess - true).sum())
+            size += float(np.square(true).sum())
+    return {"pictures": (off / size) ** 0.5, "left-out light": (left / size) ** 0.5}
+
+
+def strand_errors(capture: Capture, truth: StrandTruth, model: Path, seed: int) -> dict[str, float]:
+    """F within 2 mm and 20°, and the median angle to the nearest true strand within 5 mm."""
+    shutil.rmtree(model, ignore_errors=True)
+    reconstruct(capture, Model(model), options=ReconstructOptions(seed=seed))
+    strands = Model(model).strands()
+    found, true = strands.resampled(1e-3), truth.whole.resampled(1e-3)
+    distance, nearest = cKDTree(true.points).query(found.points)
+    cosine = np.abs((found.tangents() * true.tangents()[nearest]).sum(axis=1))[distance < 5e-3]
+    score = truth.score(strands)["visible"]["2mm_20deg"]
+    return {
+        "F": score["f"],
+        "directions °": float(np.degrees(np.arccos(min(1.0, np.median(cosine))))),
+    }
+
+
+def measure(
+    out: Path, subject: Subject, size: Size, seed: int, progress: Progress
+) -> dict[str, Any]:
+    """Each motion's errors as shot and stabilised, and those of the still subject."""
+    (out / "truth").mkdir(parents=True, exist_ok=True)
+    write_strands(out / "truth" / "strands.npz", subject.strands)
+    singles = [s for s in plan(size) if s.light is not None]
+    # in the middle of the lit frames around the middle of the capture
+    at = (singles[len(singles) // 2 + size.every // 4].index - 0.5) / (len(plan(size)) - 1)
+    cases = {"still": drift(0.0, 0.0, seed)}
+    cases |= {name: drift(*d, seed) for name, d in DRIFTS.items()}
+    cases[f"jump {JUMP[0] * 1e3:g} mm, {JUMP[1]:g}°"] = drift(*JUMP, seed, at)
+    points = subject.strands.points[::50].astype(float)
+    found: dict[str, Any] = {}
+    hair: dict[str, Array] = {}
+    for k, (name, pose) in enumerate(cases.items()):
+        progress(name, k / len(cases))
+        capture = shoot(out / "captures" / str(k), subject, size, pose, seed + 7 * k)
+        if name == "still":
+            still = capture
+            write_hair_masks(capture, out / "truth")
+            for camera in capture.rig.cameras:
+                hair[camera.name] = np.asarray(capture.mask(camera.name))
+            truth = StrandTruth(still, out / "truth", samples=10_000)
+            # the same again is what noise of rendering leaves
+            again = shoot(out / "captures" / "again", subject, size, pose, seed + 99)
+            found["still"] = picture_errors(again, still, hair)
+            found["still"] |= strand_errors(again, truth, out / "model", seed)
+            save(out / f"{seed}.json", found)
+            continue
+        shutil.rmtree(out / "captures" / "stabilised", ignore_errors=True)
+        result = stabilise(capture, out / "captures" / "stabilised")
+        none = motion_errors(type(result.motion).none(), pose, plan(size), points)
+        rows = {
+            f"{name}, as shot": (capture, none),
+            f"{name}, stabilised": (
+                result.capture,
+                motion_errors(result.motion, pose, plan(size), points) | result.figures,
+            ),
+        }
+        for row, (one, errors) in rows.items():
+            found[row] = {**errors, **picture_errors(one, still, hair)}
+            found[row] |= strand_errors(one, truth, out / "model", seed)
+            save(out / f"{seed}.json", found)
+    return found
+
+
+COLUMNS = ("motion mm", "motion °", "error_mm", "pictures", "left-out light", "directions °", "F")
+
+
+def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    size = Size(64, 4, 12, 4, 1) if args.quick else Size()
+    seeds: list[dict[str, Any]] = []
+    for seed in range(args.seed, args.seed + (1 if args.quick else args.seeds)):
+        subject = simulated(args.rig, args.subject, args.head, seed)
+        seeds.append(measure(args.out / "motion", subject, size, seed, progress))
+        found = {
+            row: {c: spread([s[row][c] for s in seeds]) for c in COLUMNS if c in seeds[0][row]}
+            for row in seeds[0]
+        }
+        save(args.out / "motion.json", {"mean": found, "seeds": seeds})
+    rows = [
+        [row, *[f"{x[c]['mean']:.3f}" if c in x else "" for c in COLUMNS]]
+        for row, x in found.items()
+    ]
+    (args.out / "motion.md").write_text(markdown(["capture", *COLUMNS], rows))
+    return {"mean": found, "seeds": seeds}
+
+
+BENCHMARK = Benchmark(_bench, (*SUBJECT, SEEDS))
