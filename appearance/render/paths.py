@@ -12,9 +12,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from appearance.scene.hair_scene import SCALE, HairScene
+from appearance.scene.hair_scene import SCALE, SHINE_EXPONENT, HairScene
 from appearance.scene.opaque import opaque, opaque_index, opaque_matrix
 from reconstruction import Camera
+from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Ints
 from reconstruction.geometry.cameras import undistorted
 
@@ -85,7 +86,8 @@ class Surface:
     def towards(self, si: Any, active: Any) -> Callable[[Any, Any], Any]:
         """`eval` of `si` as a function of `(wo, active)`, for many directions."""
         hair = self.is_hair(si)
-        albedo, bsdf = self._diffuse(hair) * dr.inv_pi, self.scene.hair_bsdf
+        albedo, bsdf = self._diffuse(si, hair) * dr.inv_pi, self.scene.hair_bsdf
+        shine = self._shine(si, hair)
         fibre = None
         if bsdf is not None and hasattr(bsdf, "towards"):
             fibre = bsdf.towards(si, active & hair, self.mean_width)
@@ -93,7 +95,8 @@ class Surface:
             fibre = partial(bsdf.eval, mi.BSDFContext(), si)
 
         def value(wo: Any, active: Any) -> Any:
-            diffuse = albedo * self._cosine(si, wo, hair)
+            reflected = albedo if shine is None else albedo + shine(wo)
+            diffuse = reflected * self._cosine(si, wo, hair)
             if fibre is None:
                 return dr.select(active, diffuse, 0)
             return dr.select(active, dr.select(hair, fibre(wo, active & hair), diffuse), 0)
@@ -106,17 +109,37 @@ class Surface:
         wo = mi.warp.square_to_cosine_hemisphere(u2)
         inside = ~hair & (si.wi.z < 0)
         wo.z = dr.select(inside, -wo.z, wo.z)
-        weight = dr.select(hair & (si.wi.z < 0), 0, self._diffuse(hair))
+        diffuse = self._diffuse(si, hair)
+        if (shine := self._shine(si, hair)) is not None:
+            diffuse += dr.pi * shine(wo)
+        weight = dr.select(hair & (si.wi.z < 0), 0, diffuse)
         if self.scene.hair_bsdf is not None:
             sample, value = self.scene.hair_bsdf.sample(mi.BSDFContext(), si, u1, u2, active & hair)
             wo = dr.select(hair, sample.wo, wo)
             weight = dr.select(hair, value, weight)
         return wo, dr.select(active, weight, 0)
 
-    def _diffuse(self, hair: Any) -> Any:
+    def _diffuse(self, si: Any, hair: Any) -> Any:
         skin = mi.Color3f(*self.scene.skin)
+        if self.scene.materials is not None:
+            values = mi.Float(for_kernels(self.scene.materials.albedo.ravel()))
+            skin = dr.gather(mi.Color3f, values, si.prim_index, ~hair & si.is_valid())
         albedo = getattr(self.scene.hair, "albedo", None)
         return skin if albedo is None else dr.select(hair, mi.Color3f(*albedo), skin)
+
+    def _shine(self, si: Any, hair: Any) -> Callable[[Any], Any] | None:
+        """Specular part of the BSDF towards `wo`; None if no face has any."""
+        if self.scene.materials is None or not self.scene.materials.shine.any():
+            return None
+        values = mi.Float(for_kernels(self.scene.materials.shine))
+        share = dr.gather(mi.Float, values, si.prim_index, ~hair & si.is_valid())
+        share *= (SHINE_EXPONENT + 8) / (8 * dr.pi)
+
+        def towards(wo: Any) -> Any:
+            half = dr.normalize(si.wi + wo)
+            return share * dr.power(dr.abs(half.z), SHINE_EXPONENT)
+
+        return towards
 
     def _cosine(self, si: Any, wo: Any, hair: Any) -> Any:
         """|cos| where both directions are on one side; fibres have an outer side only."""

@@ -27,6 +27,8 @@ from reconstruction.arrays import Array, Floats, Ints
 
 SCALE = 100.0
 """Scene units per metre."""
+SHINE_EXPONENT = 60.0
+"""Of the specular lobe of `FaceMaterials`: polished plastic or metal."""
 
 
 class SceneField(Protocol):
@@ -37,13 +39,25 @@ class SceneField(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class FaceMaterials:
+    """Diffuse `albedo (F, 3)` and specular reflectance `shine (F,)` of the F faces of a head.
+
+    The specular lobe is Blinn-Phong's of exponent `SHINE_EXPONENT`, normalised.
+    """
+
+    albedo: Array
+    shine: Array
+
+
+@dataclass(frozen=True, eq=False)
 class HairScene:
     """Geometry with its acceleration structure, and materials.
 
     `mi_scene` is a `mitsuba.Scene` without emitters or sensors, in centimetres. `hair_bsdf` is a
     `mitsuba.BSDF`, or None for `DiffuseHair`. `with_hair` and `with_skin` share the geometry.
-    `field` is a reflectance field, used by `render_olat`, `render_environment`, `render_mixed` and
-    the smoothed images, not by gradients and scanlines.
+    `materials` of the head's faces replace `skin`. `field` is a reflectance field, used by
+    `render_olat`, `render_environment`, `render_mixed` and the smoothed images, not by gradients
+    and scanlines.
     """
 
     mi_scene: Any
@@ -53,6 +67,7 @@ class HairScene:
     skin: tuple[float, float, float]
     hair_bsdf: Any | None
     field: SceneField | None = None
+    materials: FaceMaterials | None = None
 
     def occluded(self, ray: Any, active: Any = True) -> Any:
         """Whether `ray` meets anything before its end.
@@ -85,12 +100,13 @@ def build_scene(
     *,
     hair: HairAppearance | DiffuseHair,
     skin: ArrayLike = (0.35, 0.25, 0.2),
+    materials: FaceMaterials | None = None,
 ) -> HairScene:
     """Build the scene of `strands` on `head`; either may be empty or absent.
 
     Strands become round cubic curves through their points (see `appearance.scene.curves`); the
-    head is a two-sided Lambertian surface of albedo `skin (3,)` in [0, 1] with flat faces. Raises
-    `ValueError` for albedos out of range.
+    head is a two-sided Lambertian surface of albedo `skin (3,)` in [0, 1] with flat faces, or of
+    `materials` per face. Raises `ValueError` for albedos out of range.
     """
     ensure_backend()
     albedo = _albedo(skin)
@@ -101,7 +117,9 @@ def build_scene(
         parts["hair"] = hair_shape
     if head_shape is not None:
         parts["head"] = head_shape
-    return HairScene(mi.load_dict(parts), hair_shape, head_shape, hair, albedo, _hair_bsdf(hair))
+    scene = mi.load_dict(parts)
+    bsdf = _hair_bsdf(hair)
+    return HairScene(scene, hair_shape, head_shape, hair, albedo, bsdf, materials=materials)
 
 
 def mitsuba_hair(hair: HairAppearance, bsdf: str = "extended_hair") -> dict[str, Any]:

@@ -164,6 +164,9 @@ class MitsubaResponder:
 
         s = self._subject
         scene = build_scene(s.strands, s.head, hair=s.hair, skin=s.skin)
+        if s.dressed is not None:
+            mesh, materials = s.dressed.mesh, s.dressed.materials
+            scene = build_scene(s.strands, mesh, hair=s.hair, materials=materials)
         if s.absorption is None:
             return scene
         return MappedStrands.alone(scene, s.strands).with_maps(HairMaps.each(s.hair, s.absorption))

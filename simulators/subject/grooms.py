@@ -102,6 +102,23 @@ GROOMS = {
 }
 
 
+BEARD = Groom(
+    strands=3_000,
+    length=(0.014, 0.016),
+    step=0.001,
+    parting_x=None,
+    gravity=20.0,
+    lift=0.008,
+    fringe=1.0,
+    clumps=600,
+    clumping=0.3,
+    wave_radius=0.0008,
+    wave_pitch=0.012,
+    helix=0.5,
+    frizz=0.0010,
+)
+
+
 @dataclass(frozen=True, eq=False)
 class HeadField:
     """Signed distance (metres, negative inside) and its gradient on a grid from `low` on."""
@@ -124,10 +141,12 @@ class HeadField:
 
 
 @cache
-def hair_field(cell: float = 0.004) -> HeadField:
-    """`_hair_distance` over the generic head's box, sampled every `cell` metres."""
+def hair_field(cell: float = 0.004, bare: bool = False) -> HeadField:
+    """`_hair_distance` over the generic head's box, sampled every `cell` metres; that to the skin
+    where the face is `bare`."""
     axes = [np.arange(a, b + cell, cell) for a, b in HEAD_BOX.T]
-    distance = _hair_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    surface = skin_distance if bare else _hair_distance
+    distance = surface(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
     gradient = np.array(np.gradient(distance, cell))
     return HeadField(distance, gradient, HEAD_BOX[0], cell)
 
@@ -155,7 +174,7 @@ def grow(groom: Groom, head: Mesh, seed: int, count: int | None = None) -> Stran
 
     The same arguments give the same bytes. Raises `ValueError` when `head` has no scalp.
     """
-    rng, field = np.random.default_rng(seed), hair_field()
+    rng, field = np.random.default_rng(seed), hair_field(bare=groom is BEARD)
     roots, normals = _roots(head, count or groom.strands, rng)
     length = _lengths(groom, roots, rng)
     paths = _step(groom, roots, normals, length, field, rng)

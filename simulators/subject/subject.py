@@ -14,12 +14,15 @@ from reconstruction import Camera, Mesh, Rig, Strands, read_obj, read_strands
 from reconstruction.arrays import Array
 from reconstruction.files.strands import READABLE
 from reconstruction.head.generic import generic_head
+from simulators.subject.clothing import Dressed, dressed
 from simulators.subject.colouring import mixed_absorption
-from simulators.subject.grooms import GROOMS, covering_radius, grow
+from simulators.subject.grooms import BEARD, GROOMS, covering_radius, grow
 
 MIXED = "-mixed"
 """End of the name of a groom whose strands have several colours."""
-NAMES = (*GROOMS, *(name + MIXED for name in GROOMS))
+DRESSED = "dressed"
+"""The subject `wavy` with a beard, clothes and a hand."""
+NAMES = (*GROOMS, *(name + MIXED for name in GROOMS), DRESSED)
 
 _APPEARANCE = {
     "wavy": HairAppearance((0.12, 0.24, 0.50), 0.28, 0.30),
@@ -47,7 +50,8 @@ class Subject:
 
     `head` may be None for a hairpiece; `skin` is its diffuse albedo per linear RGB channel.
     `absorption (n_c, S, 3)`, from root to tip, is that of every strand; None: that of `hair`, which
-    is its mean otherwise.
+    is its mean otherwise. The last `beard` strands grow on the face. `dressed` is what is rendered
+    in place of `head` and `skin`.
     """
 
     name: str
@@ -56,6 +60,8 @@ class Subject:
     hair: HairAppearance
     skin: tuple[float, float, float]
     absorption: Array | None = None
+    beard: int = 0
+    dressed: Dressed | None = None
 
 
 def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subject:
@@ -69,6 +75,8 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
             f"unknown subject {name!r}: choose one of {', '.join(NAMES)}, or give a strand file "
             f"({', '.join(READABLE)})"
         )
+    if name == DRESSED:
+        return _dressed(make_subject("wavy", seed, strands), seed)
     groom, head = name.removesuffix(MIXED), generic_head()
     # the seed depends on the name, so that the grooms differ in every strand
     draw = int(np.random.SeedSequence([seed, *groom.encode()]).generate_state(1)[0])
@@ -80,6 +88,25 @@ def make_subject(name: str, seed: int = 0, strands: int | None = None) -> Subjec
     red, green, blue = (float(x) for x in absorption.mean(axis=(0, 1)))
     mean = replace(subject.hair, sigma_a=(red, green, blue))
     return replace(subject, hair=mean, absorption=absorption)
+
+
+def _dressed(bare: Subject, seed: int) -> Subject:
+    """The subject with a full beard, which its scalp then includes, and clothes."""
+    assert bare.head is not None
+    middle = bare.head.vertices[bare.head.faces].mean(axis=1)
+    x, y, z = np.abs(middle[:, 0]), middle[:, 1], middle[:, 2]
+    lips = (x < 0.026) & (z < -0.052) & (z > -0.077) & (y < -0.08)
+    cheeks = (z < -0.036 - 0.25 * np.maximum(0.03 - x, 0)) & (y < 0.0) & (z > -0.125)
+    beard = cheeks & ~lips & ~((z > -0.042) & (x < 0.028))
+    count = round(BEARD.strands * len(bare.strands) / GROOMS["wavy"].strands)
+    face = Mesh(bare.head.vertices, bare.head.faces, beard)
+    hairs = grow(BEARD, face, seed, count)
+    points = np.concatenate([bare.strands.points, hairs.points])
+    offsets = np.concatenate([bare.strands.offsets, bare.strands.offsets[-1] + hairs.offsets[1:]])
+    head = replace(face, scalp=beard | bare.head.scalp)
+    strands = Strands(points, offsets, bare.strands.radius)
+    worn = dressed(head, bare.skin)
+    return replace(bare, name=DRESSED, strands=strands, head=head, beard=count, dressed=worn)
 
 
 def load_subject(

@@ -8,17 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction import write_obj, write_strands
+from simulators.subject.clothing import PARTS
 from simulators.subject.drift import Drift
 from simulators.subject.props import Prop
 from simulators.subject.subject import Subject
 
 EXPOSURES = "exposures.jsonl"
 ABSORPTION = "absorption.npy"
+DRESSED = "dressed.npz"
 
 
 def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
-    """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`, and
-    `absorption.npy` of a subject whose strands differ.
+    """Write `strands.npz`, `head.obj` (where there is one), `appearance.json`, `poses.json`,
+    `absorption.npy` of a subject whose strands differ, and `dressed.npz` of one with clothes: all
+    that is rendered but hair, and how many of the last strands are its `beard`.
 
     All at pose 0; for a prop `prop.json` instead. `exposures.jsonl`, created empty here and written
     by `World`, has the pose of each pulse.
@@ -35,4 +38,15 @@ def write_truth(folder: Path, subject: Subject | Prop, drift: Drift) -> None:
     (folder / "appearance.json").write_text(json.dumps(appearance, indent=1) + "\n")
     if subject.absorption is not None:
         np.save(folder / ABSORPTION, subject.absorption.astype(np.float32))
+    if (worn := subject.dressed) is not None:
+        np.savez(
+            folder / DRESSED,
+            vertices=worn.mesh.vertices,
+            faces=worn.mesh.faces,
+            part=worn.part,
+            parts=PARTS,
+            albedo=worn.materials.albedo,
+            shine=worn.materials.shine,
+            beard=subject.beard,
+        )
     (folder / "poses.json").write_text(json.dumps(drift.to_dicts(), indent=1) + "\n")

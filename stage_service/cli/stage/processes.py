@@ -246,8 +246,9 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
 
 
 _GROOMS = "wavy", "straight", "curly", "coils"
-SUBJECTS = (*_GROOMS, *(f"{name}-mixed" for name in _GROOMS))
-"""The simulators' subjects; a mixed one has the strands of its groom in several colours."""
+SUBJECTS = (*_GROOMS, *(f"{name}-mixed" for name in _GROOMS), "dressed")
+"""The simulators' subjects; a mixed one has the strands of its groom in several colours, a dressed
+one a beard, clothes and a hand."""
 
 
 def add_subject(parser: argparse.ArgumentParser) -> None:

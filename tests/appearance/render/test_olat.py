@@ -13,6 +13,7 @@ from appearance.render import olat
 from appearance.render.coverage import covered_pixels
 from appearance.render.olat import render_direct, render_indirect
 from appearance.scene.hair_appearance import DiffuseHair
+from appearance.scene.hair_scene import SHINE_EXPONENT, FaceMaterials
 from reconstruction import Camera, Light, Strands, read_exr
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
@@ -37,6 +38,32 @@ def test_lambertian_radiance_is_albedo_over_pi_times_irradiance(small):
     d2 = (towards**2).sum(-1)
     expected = albedo / np.pi * light.intensity * (towards[..., 2] / d2**1.5)[..., None]
     np.testing.assert_allclose(image, expected, rtol=3e-3)
+
+
+def test_faces_have_the_albedo_and_the_blinn_phong_highlight_of_their_own(small):
+    """A plane of two triangles, the first matte, the second also shiny."""
+    albedo, shine = np.array([[0.5, 0.3, 0.1], [0.1, 0.2, 0.4]]), np.array([0.0, 0.3])
+    materials = FaceMaterials(albedo, shine)
+    scene = build_scene(small.no_hair, small.plane(), hair=HAIR, materials=materials)
+    camera = Camera.look_at("cam", 32, 24, (0.2, -0.4, 0.6), (0.02, 0.01, 0), 20, roll_deg=30)
+    light = Light("near", np.array([-0.15, 0.35, 0.5]), np.array([8.0, 4.0, 2.0]))
+    image = render_olat(scene, camera, [light], spp=64, max_depth=3, thrift=0)[0]
+    rays = camera.rays(np.stack(np.meshgrid(np.arange(32), np.arange(24)), -1))
+    hit = camera.center - rays * (camera.center[2] / rays[..., 2])[..., None]
+    second = hit[..., 1] > hit[..., 0]
+    clear = np.abs(hit[..., 1] - hit[..., 0]) > 0.02
+    towards = light.position - hit
+    d2 = (towards**2).sum(-1)
+    half = towards / np.sqrt(d2)[..., None] - rays
+    cosine = half[..., 2] / np.linalg.norm(half, axis=-1)
+    n = SHINE_EXPONENT
+    lobe = shine[second.astype(int)] * (n + 8) / (8 * np.pi) * cosine**n
+    reflected = albedo[second.astype(int)] / np.pi + lobe[..., None]
+    expected = reflected * light.intensity * (towards[..., 2] / d2**1.5)[..., None]
+    assert lobe.max() > 0.3
+    assert clear[second].any()
+    assert clear[~second].any()
+    np.testing.assert_allclose(image[clear], expected[clear], rtol=5e-3)
 
 
 SPENDING = {

@@ -45,7 +45,7 @@ from stage_service.jobs.records import JobOptions
 from stage_service.jobs.steps import STEPS, StepContext
 from stage_service.model_page.names import THRESHOLDS, threshold
 
-SUBJECTS = ("wavy", "curly", "sintel")
+SUBJECTS = ("wavy", "curly", "sintel", "dressed")
 JOB = ("reconstruct", "fit", "assess", "evaluate", "results")
 """Of the pipeline "full", what masks can change: inverse rendering is taken on no demo."""
 
@@ -68,9 +68,13 @@ PATHS = option("--paths", "paths a pixel of the frames", type=int, nargs="+", de
 
 
 def true_masks(capture: Capture, folder: Path) -> dict[str, HairMask]:
-    """What each pixel shows most of, hair or skin, by rendering the truth in `folder`."""
+    """What each pixel shows most of, hair or not, by rendering the truth in `folder`."""
     hair = HairAppearance.from_dict(json.loads((folder / "appearance.json").read_text())["hair"])
-    scene = build_scene(read_strands(folder / "strands.npz"), capture.head, hair=hair)
+    surface = capture.head
+    if (worn := folder / "dressed.npz").is_file():
+        with np.load(worn) as dressed:
+            surface = Mesh(dressed["vertices"], dressed["faces"])
+    scene = build_scene(read_strands(folder / "strands.npz"), surface, hair=hair)
     out = {}
     for camera in capture.rig.cameras:
         share = coverage(scene, camera, 64)

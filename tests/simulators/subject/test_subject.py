@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction import Rig, Strands, write_strands
 from reconstruction.head.generic import generic_head, skin_distance
+from simulators.subject.clothing import PARTS
 from simulators.subject.subject import SubjectError, check_fits, load_subject, make_subject
 
 DEMO = Path(__file__).parents[3] / "stage_service" / "rigs" / "demo.toml"
@@ -113,6 +114,27 @@ def curvature_and_torsion(line):
     speed = np.linalg.norm(d1, axis=1)
     kept = slice(4, -4)
     return (area / speed**3)[kept], ((cross * d3).sum(axis=1) / area**2)[kept]
+
+
+def test_a_dressed_subject_has_a_beard_and_parts_off_its_skin():
+    dressed, bare = make_subject("dressed", 3, strands=300), make_subject("wavy", 3, strands=300)
+    own = len(bare.strands.points)
+    assert dressed.strands.points[:own].tobytes() == bare.strands.points.tobytes()
+    beard = dressed.strands.points[own:].astype(float)
+    assert len(dressed.strands) == len(bare.strands) + dressed.beard
+    assert skin_distance(beard).min() > -1e-3
+    roots = dressed.strands.roots[-dressed.beard :]
+    assert roots[:, 2].max() < -0.03  # below the nose
+    assert roots[:, 1].max() < 0.0  # in front of the ears
+    worn = dressed.dressed
+    corners = worn.mesh.vertices[worn.mesh.faces]
+    lowest = [skin_distance(corners[worn.part == k][::31, 0]).min() for k in range(1, len(PARTS))]
+    assert min(lowest) > 2e-3
+    shoulder = (worn.part == 1) & (np.abs(corners[..., 2].mean(axis=1) + 0.2) < 2e-3)
+    x, y = corners[shoulder].mean(axis=1)[:, :2].T
+    order = np.argsort(np.arctan2((y - 0.034) / 0.11, x / 0.2))
+    changes = np.count_nonzero(np.diff(worn.materials.albedo[shoulder][order, 0]))
+    assert 1.0e-3 < 1.0 / changes < 2.5e-3  # metres of a circumference of a metre
 
 
 @pytest.mark.parametrize(
