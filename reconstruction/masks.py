@@ -24,6 +24,7 @@ from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import mesh_depth, mesh_silhouette
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.hair_features import (
+    FAINTEST_GLOSS,
     TwoClasses,
     clear_classes,
     looks,
@@ -42,6 +43,11 @@ from reconstruction.report.report import Stage
 Source = Literal["user", "geometry", "geometry alone", "reflectance", "silhouette"]
 
 OUTLINE = 2e-3  # metres, at least one pixel: uncertainty of a head's outline
+MATTE_LIGHTS = 24
+"""Least number of single lights by which cloth is separated from hair: with 16, a tenth of rendered
+hair is matte over `_NEAR` pixels, with 24 a fiftieth."""
+_NEAR = 9  # pixels of a square whose majority decides whether a pixel off the head is glossy
+_FEWEST_GLOSSY = 0.1  # of the pixels off the head; with fewer the head is misplaced
 _PLACE = 3e-3  # metres: cells in which the scores of all cameras are averaged
 _SAME_PLACE = 5e-3  # metres: difference allowed between two cameras' depths of one surface point
 MOST_DISAGREEMENT = 0.15
@@ -177,7 +183,7 @@ class _View:
 
     `outside` pixels lie over `OUTLINE` outside the head's outline; `standing` and `lying` pixels
     have points off and on the head. `looks (4, P)` are the features of `hair_features` at the P
-    pixels of the subject, None with too few lights.
+    pixels of the subject under `lights` lights, None with too few.
     """
 
     camera: Camera
@@ -186,6 +192,7 @@ class _View:
     standing: Bools
     lying: Bools
     looks: Array | None
+    lights: int
 
     @property
     def features(self) -> Array:
@@ -199,6 +206,11 @@ class _View:
         out[self.subject] = values
         return out
 
+    def glossy(self) -> Bools:
+        """Pixels `(H, W)` most of whose neighbours are as glossy as hair: clothes are not."""
+        some = self.image(2.0 * (self.features[0] > FAINTEST_GLOSS)) - self.subject
+        return np.asarray(ndimage.uniform_filter(some, _NEAR) > 0)
+
     @classmethod
     def of(cls, capture: Capture, camera: Camera, subject: Bools, geometry: MaskGeometry) -> _View:
         """The evidence from `geometry` and the OLAT frames of `capture`."""
@@ -210,7 +222,8 @@ class _View:
         off, on = geometry.votes(camera)
         standing, lying = subject & (off > on), subject & covered & (on > off)
         features = looks(capture, camera.name, subject)
-        return cls(camera, subject, outside, standing, lying, features)
+        lights = sum(capture.has_light(n, camera.name) for n in capture.olat_lights())
+        return cls(camera, subject, outside, standing, lying, features, lights)
 
     def mask(self, hair: Bools, source: Source, decided: float) -> HairMask:
         """The mask with `hair (H, W)` restricted to the subject."""
@@ -236,28 +249,36 @@ def _by_looks(views: list[_View], geometry: MaskGeometry) -> dict[str, HairMask]
     """Masks of `views` by reflectance; none if it forms one cluster and there are no examples.
 
     The classes are estimated from all cameras together. A pixel's score is its own plus half the
-    mean score of its surface point over all cameras.
+    mean score of its surface point over all cameras. What lies off the head and is not matte is an
+    example of hair, and certainly hair if gloss or reflectance is no evidence.
     """
     if not views:
         return {}
+    measured = min(v.lights for v in views) >= MATTE_LIGHTS
     pixels = np.concatenate([v.features.T for v in views])
-    hair = np.concatenate([(v.outside | v.standing)[v.subject] for v in views])
-    if hair.any():
-        classes: TwoClasses | None = two_classes(pixels, hair)
+    off = [v.outside | v.standing for v in views]
+    hair = [o & v.glossy() if measured else o for o, v in zip(off, views, strict=True)]
+    if sum(h.sum() for h in hair) < _FEWEST_GLOSSY * sum(o.sum() for o in off):
+        hair = off
+    examples = np.concatenate([h[v.subject] for h, v in zip(hair, views, strict=True)])
+    if examples.any():
+        classes: TwoClasses | None = two_classes(pixels, examples, measured)
     else:
-        classes = clear_classes(pixels)
+        classes = clear_classes(pixels, measured)
     if classes is None:
         return {}
     source: Source = "reflectance" if geometry.head is None else "geometry"
     if not classes.weights.any():
         source = "geometry alone"
-    scores = [v.image(classes.scores(v.features)) + v.standing for v in views]
+    prior = [v.standing | v.outside if measured else v.standing for v in views]
+    scores = [v.image(classes.scores(v.features)) + p for v, p in zip(views, prior, strict=True)]
     places = [positions(v.camera, v.subject, geometry) for v in views]
     common = _by_place(places, scores)
     out = {}
-    for view, score, place in zip(views, scores, common, strict=True):
+    for view, known, score, place in zip(views, hair, scores, common, strict=True):
         near = ndimage.gaussian_filter(view.subject.astype(np.float64), 0.5)
-        total = np.where(view.outside, 6.0, score + 0.5 * place) * view.subject
+        certain = view.outside & known & (source == "geometry alone" or not measured)
+        total = np.where(certain, 6.0, score + 0.5 * place) * view.subject
         smooth = ndimage.gaussian_filter(total, 0.5) / np.maximum(near, 1e-9)
         out[view.camera.name] = view.mask(smooth > 0, source, 1.0)
     return out

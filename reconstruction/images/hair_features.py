@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import logsumexp, softmax
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
 from reconstruction.capture.folder import Capture
@@ -28,6 +29,10 @@ FAINTEST_GLOSS = float(np.log(0.12 + 0.03))
 _CLEAR = 4.0
 """Standard deviations between the means of separate clusters: rendered hair and skin have 4.7 to
 6.5, hair alone up to 3.6."""
+_MATTE = 3.0
+"""The same of hair and matte surfaces of its colour: 3.6 to 4.2 in rendered ones."""
+_KINDS = 4
+"""Gaussians of hair, skin and cloth together: two of hair, or of skin."""
 _RIGHT = 0.8
 """Share of known hair, and of known skin, that must be classified correctly."""
 _ITERATIONS = 25
@@ -107,36 +112,49 @@ def matte_fit(
 
 @dataclass(frozen=True, eq=False)
 class TwoClasses:
-    """Log odds of hair, linear in the features of `looks`.
+    """Log odds of hair by K Gaussians with one covariance, of which `hair (K,)` are hair.
 
-    `apart` is the distance of the classes' means in common standard deviations.
+    Their log densities are `weights (K, 4)` times the features of `looks` plus `offsets (K,)`, up
+    to a common term. `apart` is the distance of two Gaussians' means in common standard deviations.
     """
 
     weights: Array
-    offset: float
+    offsets: Array
+    hair: Bools
     apart: float = 0.0
+
+    @classmethod
+    def same(cls, score: float) -> TwoClasses:
+        """One log odds everywhere."""
+        return cls(np.zeros((2, 4)), np.array([score, 0.0]), np.array([True, False]))
 
     def scores(self, looks: Array) -> Array:
         """Log odds `(...)` of hair for `looks (4, ...)`, clipped to ±5."""
-        return np.asarray(np.clip(np.tensordot(self.weights, looks, 1) + self.offset, -5, 5))
+        density = np.moveaxis(np.tensordot(self.weights, looks, 1), 0, -1) + self.offsets
+        hair, other = (logsumexp(density[..., k], axis=-1) for k in (self.hair, ~self.hair))
+        return np.asarray(np.clip(hair - other, -5, 5))
 
 
-def clear_classes(looks: Array) -> TwoClasses | None:
+def clear_classes(looks: Array, measured: bool = True) -> TwoClasses | None:
     """Hair and skin among pixels with `looks (N, 4)`, without examples.
 
-    Two Gaussians with one covariance, initialised by gloss. None if they are less than `_CLEAR`
-    apart, or the hair class ends as the less glossy one.
+    Two Gaussians with one covariance, initialised by gloss. They must be `_CLEAR` apart and hair
+    the glossier one. If gloss is `measured` under enough lights and its medians are on either side
+    of `FAINTEST_GLOSS`, `_MATTE` suffices, as for cloth of the hair's colour, and `_components`
+    separate them. Otherwise None.
     """
     x = looks[_few(looks)]
     found = _mixture(x, [0, 1, 2, 3], np.zeros(len(x), bool), x[:, 0] < FAINTEST_GLOSS)
-    if found is None or found.apart < _CLEAR:
+    hair = np.zeros(len(x), bool) if found is None else found.scores(x.T) > 0
+    if found is None or not hair.any() or hair.all():
         return None
-    hair = found.scores(x.T) > 0
-    glossier = hair.any() and not hair.all() and np.median(x[hair, 0]) > np.median(x[~hair, 0])
-    return found if glossier else None
+    gloss, other = np.median(x[hair, 0]), np.median(x[~hair, 0])
+    if measured and found.apart >= _MATTE and other < FAINTEST_GLOSS < gloss:
+        return _components(x, found)
+    return found if found.apart >= _CLEAR and gloss > other else None
 
 
-def two_classes(looks: Array, hair: Bools) -> TwoClasses:
+def two_classes(looks: Array, hair: Bools, measured: bool = True) -> TwoClasses:
     """Hair and skin among pixels with `looks (N, 4)`, of which `hair (N,)` are certainly hair.
 
     Without `clear_classes`, skin is sought among the other pixels with less gloss than nine in ten
@@ -144,16 +162,16 @@ def two_classes(looks: Array, hair: Bools) -> TwoClasses:
     classes overlap, all other pixels get the class of their majority. If the certain hair is matte,
     as with a misplaced head, all other pixels are skin.
     """
-    if clear := clear_classes(looks):
+    if clear := clear_classes(looks, measured):
         return clear
     if np.median(looks[hair, 0]) < FAINTEST_GLOSS:
-        return TwoClasses(np.zeros(4), -5.0)
+        return TwoClasses.same(-5.0)
     matte = ~hair & (looks[:, 0] < np.quantile(looks[hair, 0], _LIKE_HAIR))
     share = float(matte.sum() / max((~hair).sum(), 1))
     if share <= 2 * _LIKE_HAIR:
-        return TwoClasses(np.zeros(4), 5.0)
+        return TwoClasses.same(5.0)
     pure = 1 - _LIKE_HAIR / share  # at most a tenth of the hair is among them
-    other = TwoClasses(np.zeros(4), 1.0 if share < 0.5 else -1.0)
+    other = TwoClasses.same(1.0 if share < 0.5 else -1.0)
     return split(looks, hair, matte, pure) or other
 
 
@@ -201,6 +219,39 @@ def _mixture(looks: Array, columns: list[int], hair: Bools, start: Bools) -> Two
         prior = np.clip(skin[~hair].mean(), 0.02, 0.98)
         odds = np.clip(x @ weights + offset + np.log(1 / prior - 1), -30, 30)
         skin = np.where(hair, 0.0, 1 / (1 + np.exp(odds)))
-    every = np.zeros(looks.shape[1])
-    every[columns] = weights
-    return TwoClasses(every, offset, float(np.sqrt((means[0] - means[1]) @ weights)))
+    every = np.zeros((2, looks.shape[1]))
+    every[0, columns] = weights
+    apart = float(np.sqrt((means[0] - means[1]) @ weights))
+    return TwoClasses(every, np.array([offset, 0.0]), np.array([True, False]), apart)
+
+
+def _components(x: Array, classes: TwoClasses) -> TwoClasses:
+    """The two `classes` of pixels with looks `x (N, 4)` as `_KINDS` Gaussians of one covariance.
+
+    The widest is halved and all are estimated anew by expectation maximisation until there are as
+    many. Hair lies above the largest gap between their mean gloss. Priors are even between hair and
+    the rest.
+    """
+    share = 1 / (1 + np.exp(-classes.scores(x.T)))
+    shares, scale = np.stack([share, 1 - share]), x.std(axis=0) + 1e-4
+    while True:
+        for _ in range(_ITERATIONS):
+            size = shares.sum(axis=1)
+            means = shares @ x / size[:, None]
+            spread = [((x - m).T * w) @ (x - m) for m, w in zip(means, shares, strict=True)]
+            within = sum(spread) / len(x) + 1e-3 * np.diag(scale**2)
+            weights = np.linalg.solve(within, means.T).T
+            offsets = np.log(size) - 0.5 * (weights * means).sum(axis=1)
+            shares = softmax(weights @ x.T + offsets[:, None], axis=0)
+        if len(means) == _KINDS:
+            break
+        axes = [np.linalg.eigh(s / np.outer(scale, scale)) for s in spread]
+        widest = int(np.argmax([values[-1] for values, _ in axes]))
+        side = ((x - means[widest]) / scale) @ axes[widest][1][:, -1] > 0
+        shares = np.concatenate([shares, shares[widest : widest + 1] * side])
+        shares[widest] *= ~side
+    gloss = np.sort(means[:, 0])
+    gap = int(np.argmax(np.diff(gloss)))
+    hair = means[:, 0] > gloss[gap : gap + 2].mean()
+    offsets -= np.where(hair, np.log(size[hair].sum()), np.log(size[~hair].sum()))
+    return TwoClasses(weights, offsets, hair, classes.apart)

@@ -313,6 +313,12 @@ def test_points_off_the_head_are_hair(sphere_capture: Capture) -> None:
         assert same[name].skin.sum() > 0.85 * same[name].subject.sum()
 
 
+def test_matte_parts_beside_the_head_are_not_hair(hairy_capture: Capture) -> None:
+    """A head of 6 cm in a ball of 10 cm whose lower half is matte: shoulders under hair."""
+    for name, mask in hair_masks(hairy_capture, head=ball(0.06)).items():
+        assert iou(mask.hair, upper(hairy_capture.rig.camera(name))[1]) > 0.93
+
+
 def test_the_users_mask_wins(shoot: Callable[..., Capture]) -> None:
     capture = shoot(sweep=False)
     (capture.path / "masks").mkdir()
@@ -413,6 +419,19 @@ def test_flat_hair_that_is_partly_matte_does_not_blur_the_colours() -> None:
     odds = two_classes(np.concatenate([sure, flat, skin]), known).scores
     assert (odds(flat.T) > 0).mean() > 0.99
     assert (odds(skin.T) < 0).mean() > 0.99
+
+
+def test_cloth_of_the_colour_of_hair_is_separated_by_gloss_and_skin_by_colour() -> None:
+    hair, cloth, skin = (
+        looks_of(*a) for a in ((0.2, 0.5, 1500, 0), (0.05, 0.5, 900, 1), (0.1, 0.0, 400, 2))
+    )
+    everything = np.concatenate([hair, cloth, skin])
+    found = clear_classes(everything)
+    assert found is not None
+    assert (found.scores(hair.T) > 0).mean() > 0.93
+    assert (found.scores(cloth.T) < 0).mean() > 0.93
+    assert (found.scores(skin.T) < 0).mean() > 0.99
+    assert clear_classes(np.concatenate([hair, cloth]), measured=False) is None
 
 
 def test_a_single_class_is_not_split() -> None:
