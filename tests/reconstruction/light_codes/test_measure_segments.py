@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,11 @@ QUICK = ReconstructOptions(
 
 
 @pytest.fixture(scope="module")
-def shot(fibres: Any, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return fibres.shoot(tmp_path_factory.mktemp("fibres") / "capture")  # type: ignore[no-any-return]
+def shot(
+    make_fibres: Any, fibre_lamps: Any, fibres: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Capture:
+    stage = make_fibres(lights=fibre_lamps(16, fibres.cameras))
+    return stage.shoot(tmp_path_factory.mktemp("fibres") / "capture")  # type: ignore[no-any-return]
 
 
 def run(capture: Capture, model: Path, method: str = "photometric") -> Any:
@@ -52,9 +56,9 @@ def test_photometric_finds_the_fibres_and_reports_what_it_saw(
     assert reported == [s.name for s in report.stages]
     strands = read_strands(tmp_path / "strands.npz")
     figures = compare_strands(strands, fibres.strands, samples=None)["all"]
-    assert figures["2mm_20deg"]["f"] > 0.6
+    assert figures["2mm_20deg"]["f"] > 0.7
     codes = report["lightcodes"].figures
-    assert codes["lights"] == 36
+    assert codes["lights"] == 16
     assert codes["cameras_with_a_light_beside"] == len(fibres.cameras)
     assert report["depth"].figures["visible_neighbours"] > 2
     assert "roots" in [x.what for x in report["strands"].left_out]
@@ -94,7 +98,10 @@ def test_fibres_are_found_in_views_that_are_all_saturated(fibres: Any, tmp_path:
     assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.8
 
 
-def test_missing_inputs_raise_errors_that_name_them(fibres: Any, tmp_path: Path) -> None:
+def test_missing_inputs_raise_errors_that_name_them(
+    make_fibres: Any, fibre_cameras: Any, fibre_lamps: Any, tmp_path: Path
+) -> None:
+    fibres = make_fibres(cameras=fibre_cameras(3), lights=fibre_lamps(4))
     dark = fibres.shoot(tmp_path / "dark", brightness=0.0)
     with pytest.raises(CaptureError, match=r"no hair pixel has a direction|no segment of"):
         run(dark, tmp_path / "m")
@@ -144,9 +151,9 @@ def test_a_hull_is_cut_to_a_ball_and_its_grid_with_it() -> None:
 
 
 def test_a_camera_without_frames_of_single_lights_is_left_out_of_line_stereo(
-    fibres: Any, tmp_path: Path
+    shot: Capture, fibres: Any, tmp_path: Path
 ) -> None:
-    path = fibres.shoot(tmp_path / "capture").path
+    path = shutil.copytree(shot.path, tmp_path / "capture")
     name, journal = fibres.cameras[0].name, path / "journal.jsonl"
     records = [json.loads(line) for line in journal.read_text().splitlines()]
     lost = {"file": None, "reason": "dropped"}
@@ -155,4 +162,4 @@ def test_a_camera_without_frames_of_single_lights_is_left_out_of_line_stereo(
     report = run(Capture(path), tmp_path / "model")
     assert any(w.startswith(f"{name}: no lit frame") for w in report["lightcodes"].warnings)
     strands = read_strands(tmp_path / "model" / "strands.npz")
-    assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.5
+    assert compare_strands(strands, fibres.strands, samples=None)["all"]["2mm_20deg"]["f"] > 0.6
