@@ -72,13 +72,17 @@ class Collisions:
         for _ in range(2):  # near the skin, then all points of the strands that are inside
             chosen = np.isin(strands.strand_of_point[starts], index)
             parts = np.maximum(np.ceil(step / STEP), 1).astype(np.int64)
-            fine = _subdivided(strands.subset(index), np.where(near, parts, 1)[chosen])
-            height = self.distance(fine.points)[0]
-            index = index[np.unique(fine.strand_of_point[height < -SKIN])]
+            fine, own = _subdivided(strands.subset(index), np.where(near, parts, 1)[chosen])
+            between = np.ones(len(fine.points), bool)
+            between[own] = False
+            fine_height = np.empty(len(between))
+            fine_height[own] = height[np.isin(strands.strand_of_point, index)]
+            fine_height[between] = self.distance(fine.points[between])[0]
+            index = index[np.unique(fine.strand_of_point[fine_height < -SKIN])]
             near = np.ones(len(starts), bool)
         self.index = index
         """The strands that pass through the head."""
-        self._fine, self._height = fine, height
+        self._fine, self._height = fine, fine_height
 
     @property
     def inside(self) -> Inside:
@@ -271,8 +275,11 @@ def _at(line: Array, arc: Array, where: Array) -> Array:
     return np.stack([np.interp(where, arc, column) for column in line.T], axis=1)
 
 
-def _subdivided(strands: Strands, parts: Ints) -> Strands:
-    """The strands with their segments `(N - S,)` in equal `parts`; further values interpolated."""
+def _subdivided(strands: Strands, parts: Ints) -> tuple[Strands, Ints]:
+    """The strands with their segments `(N - S,)` in equal `parts`; further values interpolated.
+
+    Also the indices `(N,)` of the given points among the new.
+    """
     repeats = np.ones(len(strands.points), np.int64)
     repeats[strands.segment_starts] = parts
     left = np.repeat(np.arange(len(repeats)), repeats)
@@ -280,7 +287,7 @@ def _subdivided(strands: Strands, parts: Ints) -> Strands:
     share = ((np.arange(len(left)) - first[left]) / repeats[left])[:, None]
     values = _values(strands)
     values = values[left] * (1 - share) + values[np.minimum(left + 1, len(values) - 1)] * share
-    return _of_values(values, np.append(first, len(left))[strands.offsets], strands)
+    return _of_values(values, np.append(first, len(left))[strands.offsets], strands), first
 
 
 def _values(strands: Strands) -> Array:
