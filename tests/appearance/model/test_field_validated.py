@@ -168,7 +168,7 @@ def test_a_field_that_makes_pictures_worse_is_not_rendered(own, monkeypatch):
         return replace(fit(*args), decision=WORSE)
 
     monkeypatch.setattr(fitted_field, "fit_field", worse)
-    result = fit_field_validated(capture, model, request=REQUEST)
+    result = fit_field_validated(capture, model, request=replace(REQUEST, spp=32))
     assert not result["rendered"]
     assert FittedModel.load(model, capture).field is None
 
