@@ -326,7 +326,9 @@ class SunFit:
         """Standard error of log sigma_a by channel; None if the colour does not determine it."""
         self.progress("error of the absorption", 0.97)
         sampling = Sampling(self.options.colour_spp, MAX_DEPTH, self.seed)
-        errors = absorption_error(self.scene, self.covered.hair, colours, sampling)
+        errors = absorption_error(
+            self.scene, self.covered.hair, colours, sampling, self.options.error_paths
+        )
         return [float(x) if np.isfinite(x) else None for x in errors]
 
     def _views(self, hair: Sequence[Observed]) -> list[tuple[Observed, VisibleFibres]]:

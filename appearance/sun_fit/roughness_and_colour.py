@@ -27,6 +27,7 @@ from appearance.scene.hair_scene import HairScene
 from appearance.sun_fit.fit_pixels import FitPixels, cosines_of_lights
 from appearance.sun_fit.hair_parts import SIDE, parts_of
 from appearance.sun_fit.mirror_samples import LobeBins
+from appearance.sun_fit.options import FitOptions
 from reconstruction.arrays import Array
 
 LEAST_ROUGHNESS, GREATEST_ROUGHNESS = 0.02, 0.9
@@ -37,8 +38,6 @@ TOLERANCE = 0.01
 """Relative error of the mean colour at which Algorithm 1 ends."""
 MORE = 2.0
 """Factor on the absorption of the two renderings for the derivative."""
-LEAST_PATHS = 100_000
-"""Fewest paths of each of those renderings."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +155,11 @@ def fit_colour(
 
 
 def absorption_error(
-    scene: HairScene, hair: Sequence[Observed], colours: Colours, sampling: Sampling = SAMPLING
+    scene: HairScene,
+    hair: Sequence[Observed],
+    colours: Colours,
+    sampling: Sampling = SAMPLING,
+    least_paths: int = FitOptions.error_paths,
 ) -> Array:
     """Standard error of log sigma_a `(3,)`, over pixels under lights from all around.
 
@@ -165,7 +168,7 @@ def absorption_error(
     without a derivative, as of black hair, and at an end of C's range.
     """
     paths = sampling.spp * sum(len(o.pixels) for o in hair)
-    sampling = replace(sampling, spp=sampling.spp * max(1, LEAST_PATHS // max(paths, 1)))
+    sampling = replace(sampling, spp=sampling.spp * max(1, least_paths // max(paths, 1)))
     as_dark = (1 / MORE, 1.0, MORE)
     each = [
         replace(colours.hair, sigma_a=_rgb(x * np.array(colours.hair.sigma_a))) for x in as_dark

@@ -41,7 +41,7 @@ from reconstruction.tangents.estimate import Measured, light_groups, thinned
 
 RADIUS, HEAD = 0.1, 0.09
 LIGHTS = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(12, 1.2, 0.0))]
-QUICK = ReconstructOptions(grid=7e-3, roots=150, max_length=0.12)
+QUICK = ReconstructOptions(grid=5e-3, roots=150, max_length=0.12)
 COARSE = ReconstructOptions(grid=8e-3, roots=100, max_length=0.1, measure=MeasureOptions(thin=8e-3))
 
 
@@ -137,7 +137,6 @@ def runs_down(strands: Strands, within_deg: float = 5, mostly: float = 0.75) -> 
 
     Half of their points within `within_deg`, the share `mostly` of them within 20°.
     """
-    print("LLL", len(strands), len(strands.points))
     assert len(strands) > 300
     distance = np.linalg.norm(strands.roots, axis=1)
     assert np.abs(distance - HEAD).max() < 1e-3
@@ -145,7 +144,6 @@ def runs_down(strands: Strands, within_deg: float = 5, mostly: float = 0.75) -> 
     outer = (radius > 0.098) & (np.abs(strands.points[:, 2]) < 0.07)
     along = (strands.tangents()[outer] * down(strands.points[outer])).sum(axis=1)
     turned = np.degrees(np.arccos(np.clip(np.abs(along), 0, 1)))
-    print("LLL", np.median(turned), (turned<20).mean())
     assert np.median(turned) < within_deg
     assert (turned < 20).mean() > mostly
 

@@ -157,7 +157,7 @@ class TinyStage:
                 **{"roots": 2000, "grid": 4e-3, "within": 0.05},
                 "measure": {"bank": {"wavelength": 6.0, "count": 24, "spread": 1.5}},
             },
-            "fit": {"iterations": 2},
+            "fit": {"iterations": 2, "error_paths": 10_000},
             "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
         }
         return {"name": "light_planes", "options": {**quality, **options}}

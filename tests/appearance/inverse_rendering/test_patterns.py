@@ -98,7 +98,7 @@ def captured(plain, tufted, tmp_path_factory):
 
 def test_a_capture_of_patterns_is_fitted(captured, tufted):
     capture, model = captured
-    options = FitOptions(hair_pixels=200, colour_spp=16)
+    options = FitOptions(hair_pixels=200, error_paths=10_000)
     report = fit(capture, model, options=options)
     assert any("Patterns show no highlight" in w for w in report["roughness"].warnings)
     sun = FittedAppearance.load(model)

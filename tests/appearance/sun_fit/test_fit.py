@@ -11,7 +11,6 @@ from appearance import Exposure, HairAppearance, HeldOut, build_scene, fit, rend
 from appearance.bsdf.longitudinal import variance_of_roughness
 from appearance.observations import chosen, observe
 from appearance.render.coverage import coverage
-from appearance.sun_fit import roughness_and_colour
 from appearance.sun_fit.fit_pixels import check_strands
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.options import FitOptions
@@ -36,7 +35,7 @@ from reconstruction.geometry.lights import dome_positions
 TRUTH = HairAppearance((0.15, 0.3, 0.6), 0.25, 0.2)
 SKIN = (0.4, 0.3, 0.2)
 LEFT_OUT = HeldOut(("cam_2",), ("l5", "l7"))
-OPTIONS = FitOptions(hair_pixels=200, roughness_cameras=2, roughness_spp=36, colour_spp=16)
+OPTIONS = FitOptions(hair_pixels=200, roughness_cameras=2, roughness_spp=36, error_paths=30_000)
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +88,7 @@ def fitted(made):
 
 def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     appearance, _ = fitted
+    print("RRR", appearance.hair.beta_m, np.array(appearance.hair.sigma_a)/TRUTH.sigma_a, appearance.sigma_a_error)
     assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.05)
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.08)  # of 200 pixels
     np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.03)
@@ -96,15 +96,14 @@ def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     assert appearance.v == pytest.approx(float(variance_of_roughness(appearance.hair.beta_m)))
 
 
-def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 1)
+def test_a_fit_leaves_no_figures_of_what_it_removes(made, tmp_path):
     capture, model = made
     other = Model(tmp_path / "model")
     shutil.copytree(model.path, other.path)
     report = Report([Stage("field", figures={"rendered": True}), Stage("head")])
     other.write_report(report)
     other.file("field.npz").write_bytes(b"of an earlier fit")
-    few = replace(OPTIONS, roughness_spp=2, colour_spp=2, iterations=1)
+    few = replace(OPTIONS, roughness_spp=2, colour_spp=2, iterations=1, error_paths=1)
     fit(capture, other, held_out=HeldOut(("cam_2",)), options=few)
     assert not other.has("field.npz")
     names = [stage.name for stage in other.report().stages]
@@ -116,7 +115,7 @@ def test_fit_says_how_far_off_it_may_be(fitted):
     low, high = appearance.beta_m_interval
     assert low < TRUTH.beta_m < high
     off = np.log(np.array(appearance.hair.sigma_a) / TRUTH.sigma_a)
-    assert (np.abs(off) < 3 * np.array(appearance.sigma_a_error, float)).all()
+    assert (np.abs(off) < np.array(appearance.sigma_a_error, float)).all()
     assert report["roughness"].figures["error"] == appearance.beta_m_error
 
 

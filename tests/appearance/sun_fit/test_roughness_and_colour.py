@@ -9,7 +9,6 @@ from appearance import HairAppearance, build_scene, render_olat
 from appearance.bsdf.longitudinal import longitudinal, variance_of_roughness
 from appearance.observations import Observed
 from appearance.scene.hair_appearance import DiffuseHair
-from appearance.sun_fit import roughness_and_colour
 from appearance.sun_fit.fit import SunFit
 from appearance.sun_fit.fit_pixels import FitPixels, cosines_of_lights, covered, in_front
 from appearance.sun_fit.fitted_appearance import absorption_warnings
@@ -249,29 +248,28 @@ def test_poor_evidence_of_colours_is_warned_of(brighter_behind):
 
 
 @pytest.mark.slow
-def test_lights_that_disagree_are_in_the_absorption_s_error(brighter_behind, monkeypatch):
+def test_lights_that_disagree_are_in_the_absorption_s_error(brighter_behind):
     """The logs of the gains, ±0.18 and 0, are 0.105 off in the mean of three."""
-    monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 30_000)
     scene, o = brighter_behind
     hair, few = scene.hair, o.lights[::3]
-    error = absorption_error(scene, [o], Colours((0.5, 0.4, 0.3), hair, (0.3,) * 3, [], []))
+    colours = Colours((0.5, 0.4, 0.3), hair, (0.3,) * 3, [], [])
+    error = absorption_error(scene, [o], colours, least_paths=30_000)
     each = [replace(hair, sigma_a=tuple(x * y for y in hair.sigma_a)) for x in (0.8, 1.25)]
     means = [observed(scene.with_hair(x), o.camera, few, 96).radiance.mean((0, 1)) for x in each]
     derivative = np.log(means[0] / means[1]) / np.log(1.25 / 0.8)
     np.testing.assert_allclose(error, 0.105 / derivative, rtol=0.4)
     no_blue = replace(o, radiance=o.radiance * np.array([1, 1, 0], np.float32))
-    again = absorption_error(scene, [no_blue], Colours((0.5, 0.4, 0.3), hair, (0.3,) * 3, [], []))
+    again = absorption_error(scene, [no_blue], colours, least_paths=30_000)
     np.testing.assert_allclose(again[:2], error[:2], rtol=1e-6)
 
 
-def test_hair_that_no_absorption_changes_has_no_error(brighter_behind, monkeypatch):
-    monkeypatch.setattr(roughness_and_colour, "LEAST_PATHS", 1)
+def test_hair_that_no_absorption_changes_has_no_error(brighter_behind):
     scene, o = brighter_behind
     o = o.where(np.arange(0, len(o.pixels), 4))
     for sigma_a, colour in (((0.0,) * 3, (0.5,) * 3), ((0.3,) * 3, (LEAST_ALBEDO, MOST_ALBEDO, 1))):
         hair = replace(scene.hair, sigma_a=sigma_a)
         colours = Colours(colour, hair, (0.3,) * 3, [], [])
-        assert np.isinf(absorption_error(scene, [o], colours, replace(SAMPLING, spp=4))).all()
+        assert np.isinf(absorption_error(scene, [o], colours, replace(SAMPLING, spp=4), 1)).all()
     assert len(absorption_warnings((1.0, 0.1, 0.0), [None, 0.02, None])) == 2
 
 
