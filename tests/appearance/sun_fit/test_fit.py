@@ -88,7 +88,6 @@ def fitted(made):
 
 def test_fit_recovers_the_appearance_that_was_rendered(fitted):
     appearance, _ = fitted
-    print("RRR", appearance.hair.beta_m, np.array(appearance.hair.sigma_a)/TRUTH.sigma_a, appearance.sigma_a_error)
     assert appearance.hair.beta_m == pytest.approx(TRUTH.beta_m, rel=0.05)
     np.testing.assert_allclose(appearance.hair.sigma_a, TRUTH.sigma_a, rtol=0.08)  # of 200 pixels
     np.testing.assert_allclose(appearance.skin, SKIN, rtol=0.03)

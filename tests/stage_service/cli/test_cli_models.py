@@ -108,7 +108,7 @@ def error_of_render(made, capsys) -> float:
 @pytest.fixture(scope="module")
 def fitted(made):
     """What `hairstage fit` printed; the model of `made` then has maps and lights."""
-    options = json.dumps({"inverse_rendering": INVERSE})
+    options = json.dumps({"inverse_rendering": INVERSE, "fit": {"error_paths": 10_000}})
     words = ["fit", made.capture, made.model, "--stages", "sun,spatial", "--options", options]
     with redirect_stdout(StringIO()) as printed:
         assert main([*map(str, words), "--json"]) == 0
