@@ -31,6 +31,8 @@ _CLEAR = 4.0
 6.5, hair alone up to 3.6."""
 _MATTE = 3.0
 """The same of hair and matte surfaces of its colour: 3.6 to 4.2 in rendered ones."""
+_ENOUGH = 5.15
+"""The same from which on two Gaussians suffice: 99.5 % of each lies on its own side."""
 _KINDS = 4
 """Gaussians of hair, skin and cloth together: two of hair, or of skin."""
 _RIGHT = 0.8
@@ -141,7 +143,7 @@ def clear_classes(looks: Array, measured: bool = True) -> TwoClasses | None:
     Two Gaussians with one covariance, initialised by gloss. They must be `_CLEAR` apart and hair
     the glossier one. If gloss is `measured` under enough lights and its medians are on either side
     of `FAINTEST_GLOSS`, `_MATTE` suffices, as for cloth of the hair's colour, and `_components`
-    separate them. Otherwise None.
+    separate them unless they are `_ENOUGH` apart. Otherwise None.
     """
     x = looks[_few(looks)]
     found = _mixture(x, [0, 1, 2, 3], np.zeros(len(x), bool), x[:, 0] < FAINTEST_GLOSS)
@@ -149,7 +151,7 @@ def clear_classes(looks: Array, measured: bool = True) -> TwoClasses | None:
     if found is None or not hair.any() or hair.all():
         return None
     gloss, other = np.median(x[hair, 0]), np.median(x[~hair, 0])
-    if measured and found.apart >= _MATTE and other < FAINTEST_GLOSS < gloss:
+    if measured and _MATTE <= found.apart < _ENOUGH and other < FAINTEST_GLOSS < gloss:
         return _components(x, found)
     return found if found.apart >= _CLEAR and gloss > other else None
 
