@@ -61,7 +61,7 @@ class World:
             width = 30 if self.balls is BALLS and not self.mirror else 46
             self.rig.append(Camera.look_at(f"cam_{k}", SIZE, SIZE, eye, (0, 0, 0), width))
         self.lamps = [
-            Light(f"led_{k}", p, np.ones(3)) for k, p in enumerate(dome_positions(48, 1.2, -60.0))
+            Light(f"led_{k}", p, np.ones(3)) for k, p in enumerate(dome_positions(24, 1.2, -60.0))
         ]
 
     def entries(self, by: float = 1.0, turn: Any = None) -> None:
