@@ -154,10 +154,10 @@ class TinyStage:
         """The whole pipeline at a quality for pictures of 24 pixels."""
         quality = {
             "reconstruct": {
-                **{"roots": 2000, "grid": 4e-3, "within": 0.05},
+                **{"roots": 1000, "grid": 6e-3, "within": 0.05},
                 "measure": {"bank": {"wavelength": 6.0, "count": 24, "spread": 1.5}},
             },
-            "fit": {"iterations": 2, "error_paths": 10_000},
+            "fit": {"iterations": 2, "roughness_spp": 4, "error_paths": 10_000},
             "assess": {"spp": 4, "relit_size": 48, "relit_spp": 4},
         }
         return {"name": "light_planes", "options": {**quality, **options}}
