@@ -57,8 +57,8 @@ QUICK = DemoKind(
         "assess": {"cameras": 1, "lights": 2, "spp": 8, "relit_size": 256, "relit_spp": 8},
         "baselines": False,
     },
-    42.0,
-    {"reconstruct": 22, "fit": 11, "relight": 6, "assess": 7, "evaluate": 13, "results": 1},
+    27.0,
+    {"reconstruct": 21, "fit": 11, "relight": 5, "assess": 12, "evaluate": 14, "results": 1},
     f"quick demo: {_SIZE}; figures are not those of the full demo",
     ("--spp", "8"),
 )
