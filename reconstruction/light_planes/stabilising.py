@@ -65,9 +65,9 @@ class Stabilised:
 def stabilise(source: Capture, out: Path, progress: Progress = silent) -> Stabilised:
     """Write the capture `out`, a new or empty folder, of `source` without the subject's motion.
 
-    Nothing is written without two usable lit frames at different times, or if the subject moved by
-    less than twice the estimated error. Frames whose pose is unknown are recorded as missing.
-    Raises `CaptureError` for a stabilised capture, and for one without a visual hull.
+    Nothing is written without two usable lit frames at different times, if no camera shows motion,
+    or if it is less than twice the estimated error. Frames whose pose is unknown are recorded as
+    missing. Raises `CaptureError` for a stabilised capture, and for one without a visual hull.
     """
     if "stabilised" in source.plan:
         raise CaptureError(f"{source.path}: its motion has been corrected already")
@@ -81,8 +81,15 @@ def stabilise(source: Capture, out: Path, progress: Progress = silent) -> Stabil
         return Stabilised(source, Motion.none(), unchanged + why, {}, tuple(stage.warnings))
     solver = _Solver.of(source, steps)
     motion = solver.solve(stage, progress)
+    shown = stage.figures.get("largest_2d_motion_px")
+    if shown is None or motion.still:
+        why = "no camera's lit frames can be registered: its motion is unknown"
+        if shown is not None:
+            most = shown * solver.view.reduced_by
+            why = f"{len(steps)} lit frames show no motion: at most {most:.2g} px"
+        return Stabilised(source, motion, unchanged + why, {}, tuple(stage.warnings))
     figures = solver.figures(motion)
-    if motion.still or figures["largest_mm"] < 2 * figures["error_mm"]:
+    if figures["largest_mm"] < 2 * figures["error_mm"]:
         why = (
             f"the subject kept still within the estimated error of {figures['error_mm']:.2g} mm "
             f"({figures['error_px']:.2g} px) in {len(steps)} lit frames"

@@ -233,7 +233,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     commit = subprocess.run(
         ["git", "rev-parse", "--short=12", "HEAD"], cwd=HERE, capture_output=True, text=True
     ).stdout.strip()
-    rows = {}
+    rows: dict[str, Any] = {}
+    size = {"cameras": cameras, "lights": lights, "side": side, "rows": args.rows}
+    results = {**size, "spp": spp, "subjects": rows}
     for k, name in enumerate(names):
         report = within(progress, name, k / len(names), 1 / len(names))
         shot = SimulatedCapture(f"published-{name}", rig, name, spp=spp, seed=args.seed)
@@ -250,9 +252,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             shutil.rmtree(out / name / made)
         kept = {k: v for k, v in rows[name].items() if k.startswith("hull")}
         save(out / "baselines" / f"{name}.json", kept)
-    size = {"cameras": cameras, "lights": lights, "side": side, "rows": args.rows}
-    results = {**size, "spp": spp, "subjects": rows}
-    save(args.out / "publish-set.json", results)
+        save(args.out / "publish-set.json", results)
     return results
 
 

@@ -206,7 +206,7 @@ def test_frames_beside_a_lost_lit_frame_are_missing(sphere: MovingSphere, tmp_pa
     [
         ([], "0 usable fully lit frames"),
         ([0], "1 usable fully lit frames"),
-        ([0, 4, 8, 12], "kept still within the estimated error of"),
+        ([0, 4, 8, 12], "4 lit frames show no motion: at most"),
     ],
 )
 def test_nothing_is_written_without_motion(
@@ -218,6 +218,16 @@ def test_nothing_is_written_without_motion(
     assert said in found.summary
     assert found.capture is source
     assert not (tmp_path / "s").exists()
+
+
+def test_a_motion_that_nothing_shows_is_not_called_still(
+    moving: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stabilising, "OUTLINE", 1.0)  # no point is left inside the masks
+    found = stabilise(moving, tmp_path / "s")
+    assert "its motion is unknown" in found.summary
+    assert found.capture is moving
+    assert found.figures == {}
 
 
 @pytest.mark.parametrize("by", [1, 3])
