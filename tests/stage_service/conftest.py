@@ -240,12 +240,17 @@ def projectors(world: World, line: str) -> str:
 
 
 class SerialPeer:
-    """Answers lines on a pseudo-terminal; keeps the far end open, as a cable does."""
+    """Answers lines on a pseudo-terminal; keeps the far end open, as a cable does.
 
-    def __init__(self, world: World, respond: Any) -> None:
+    `path` is a link that `cut` removes: the number of a closed pseudo-terminal is given to the next
+    one, which may be another test's.
+    """
+
+    def __init__(self, world: World, respond: Any, path: Path) -> None:
         self.master, self.far = pty.openpty()
         tty.setraw(self.far)
-        self.path = os.ttyname(self.far)
+        self.path = path
+        path.symlink_to(os.ttyname(self.far))
         self.world, self.respond = world, respond
         self.wake, self.waker = os.pipe()
         self.thread = threading.Thread(target=self.run, daemon=True)
@@ -291,6 +296,7 @@ class SerialPeer:
         if self.thread.is_alive():
             os.write(self.waker, CUT)
             self.thread.join()
+        self.path.unlink()
         for handle in (self.master, self.far, self.wake, self.waker):
             os.close(handle)
 
@@ -372,9 +378,13 @@ def wire(tmp_path: Path, slack: int) -> Callable[..., Wires]:
 
     def made(world: World, **timeouts: float) -> Wires:
         servers = [Server(world, handler) for handler in (Lights, Cameras)]
-        serial = [SerialPeer(world, respond) for respond in (trigger, projectors)]
-        path = tmp_path / f"rig{next(numbers) or ''}.toml"
-        ports, paths = [s.server_address[1] for s in servers], [s.path for s in serial]
+        number = next(numbers) or ""
+        serial = [
+            SerialPeer(world, respond, tmp_path / f"{respond.__name__}{number}")
+            for respond in (trigger, projectors)
+        ]
+        path = tmp_path / f"rig{number}.toml"
+        ports, paths = [s.server_address[1] for s in servers], [str(s.path) for s in serial]
         path.write_text(RIG + devices(ports, paths, slack, **timeouts))
         return Wires(load_rig_file(path), servers, serial)
 

@@ -213,6 +213,7 @@ function onEvent(kind, data) {
     S.missing = [{ ...data, at: new Date().toISOString() }, ...S.missing].slice(0, 200);
   } else if (kind === "stage.lease") {
     S.lease = data;
+    reload("lease"); // a request that is under way may return an older one
   } else if (about === "stage") {
     reload("health", "queue");
   } else if (about === "queue") {

@@ -74,6 +74,27 @@ def test_a_capture_by_the_keyboard_alone(console):
     assert http.service.captures(1)[0].outcome == "aborted"
 
 
+def test_a_lease_taken_while_the_page_loads_is_shown(console):
+    http, pages = console()
+    held: list[tuple[Any, Any]] = []
+
+    def hold_first(route: Any) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append((route, route.fetch()))
+
+    page = pages.open(prepare=lambda page: page.route("**/lease", hold_first))
+    until(lambda: page.wait_for_timeout(20) or held)
+    assert http.post("/lease", json={"holder": "Eve", "seconds": 600}).status_code == 201
+    page.wait_for_selector("text=Eve steers")  # by the event
+    with page.expect_response("**/lease"):
+        held[0][0].fulfill(response=held[0][1])  # from before the lease
+    says(page, "Dark, verified")
+    page.wait_for_timeout(300)
+    page.wait_for_selector("text=Eve steers", timeout=10_000)
+
+
 def test_invalid_numbers_in_fields_are_refused(console):
     http, pages = console()
     page = pages.open("plan")
