@@ -217,9 +217,8 @@ class Capture:
     def _read_pixels(self, step: Step, camera: str) -> Pixels:
         image, attributes = self._read(step, camera)
         full = np.float32(float(attributes.get("fullScale", np.inf)) * (1 - 1e-5))
-        # channel by channel: an eighth of the time of any(axis=-1)
-        red, green, blue = (image[..., channel] >= full for channel in range(3))
-        saturated = red | green | blue
+        saturated = np.zeros(image.shape[:2], bool)  # a tenth of the time of any(axis=-1)
+        saturated.ravel()[np.flatnonzero(image >= full) // 3] = True
         image = image if step.level in (0, 1) else image / np.float32(step.level)
         if self._by == 1:
             return image, saturated

@@ -24,7 +24,7 @@ CLEAN = 0.1  # rows: error of a stripe's centre without noise, on fibres of many
 
 NOISE_FACTOR, FAINTEST = 6.0, 0.01
 """Least height of a maximum, in deviations of the dark frame and as a share of the camera's bright
-maxima (95th percentile)."""
+maxima (95th percentile, noise included)."""
 
 DIRECT_SHARE = 0.15
 """Least share of the pixel's light over the sweep: indirect light comes from every row."""
@@ -68,7 +68,9 @@ def find_peaks(capture: Capture, camera: str, projector: str) -> Peaks:
     for row in range(-REACH, device.height + REACH):
         scan.push(row)
     noise = scan.noise()
-    floor = max(NOISE_FACTOR * noise, FAINTEST * _bright(scan.value[0]))
+    maxima = scan.value[0] if scan.least else scan.value[0][scan.value[0] > 0]
+    bright = float(np.percentile(maxima, 95)) if maxima.size else 0.0
+    floor = max(NOISE_FACTOR * noise, FAINTEST * bright, scan.least)
     strong = scan.value > floor
     layer, y, x = np.nonzero(strong)
     window = scan.window[layer, y, x].astype(np.float64)
@@ -144,11 +146,6 @@ def _profiles(projector: Projector, centres: Array, width: float) -> Array:
     return np.asarray((projector.row_weight(rows[None, :, None], v) * weights).sum(axis=-1))
 
 
-def _bright(value: Floats) -> float:
-    some = value[value > 0]
-    return float(np.percentile(some, 95)) if some.size else 0.0
-
-
 class _Tally:
     """Counts values above a floor that is known only afterwards, to a hundredth."""
 
@@ -156,16 +153,19 @@ class _Tally:
         self._counts = np.zeros(1 << 15, np.int64)
 
     def add(self, values: Floats) -> None:
+        """Count positive values."""
         # the upper half of a positive float32: the exponent and seven bits
-        positive = values[values > 0].view(np.uint32) >> 16
-        self._counts += np.bincount(positive, minlength=len(self._counts))
+        self._counts += np.bincount(values.view(np.uint32) >> 16, minlength=len(self._counts))
 
     def above(self, floor: float) -> int:
         return int(self._counts[(np.array(floor, np.float32).view(np.uint32) >> 16) + 1 :].sum())
 
 
 class Scan:
-    """The running state of one sweep: a ring of frames and each pixel's strongest maxima."""
+    """The running state of one sweep: a ring of frames and each pixel's strongest maxima.
+
+    Pixels under `least` are no maxima: half of the floor by the least noise of the frames so far.
+    """
 
     def __init__(
         self, capture: Capture, camera: str, sweep: dict[int | None, Step], rows: int, layers: int
@@ -183,6 +183,7 @@ class Scan:
         self.total = np.zeros(shape, np.float32)
         self.bright, self.maxima = _Tally(), _Tally()
         self.missing: list[int] = []
+        self.least = 0.0
         self._noises: list[float] = []
         self._dark: dict[float, Floats] = {}
 
@@ -203,7 +204,7 @@ class Scan:
             else:
                 image, clipped = self._read(step)
                 self.total += image
-                self.bright.add(image)
+                self.bright.add(image[image > self.least])
         self.ring.append(image.ravel())
         self.clip.append(clipped.ravel())
         self.held.append(held)
@@ -219,14 +220,18 @@ class Scan:
         image = response @ np.full(3, 1 / 3, np.float32) - dark
         if step.row is not None and step.row % 8 == 0:
             self._noises.append(background_noise(image))
+            self.least = 0.5 * NOISE_FACTOR * min(self._noises)
         return image, saturated
 
     def _insert(self, middle: int) -> None:
         """Keep the middle frame's maxima where they exceed the weakest of the pixel."""
         before, now, after = (self.ring[REACH + k] for k in (-1, 0, 1))
-        highest = (now > before) & (now >= after)
-        self.maxima.add(now[highest])
-        pixel = np.flatnonzero(highest & (now > self.value[-1].ravel()))
+        lit = np.flatnonzero(now > self.least)
+        value = now[lit]
+        highest = (value > before[lit]) & (value >= after[lit])
+        pixel, value = lit[highest], value[highest]
+        self.maxima.add(value)
+        pixel = pixel[value > self.value[-1].ravel()[pixel]]
         for layer in range(len(self.value)):
             better = now[pixel] > self.value[layer].ravel()[pixel]
             which, pixel = pixel[better], pixel[~better]
