@@ -21,6 +21,8 @@ GUESSED = 0.05
 """Support up to which a point is guessed."""
 
 _NEIGHBOURS = 6
+BLOCK = 1 << 18
+"""Points that are looked up together: about 500 bytes each."""
 
 
 class Lines:
@@ -46,11 +48,15 @@ class Lines:
         `(N,)` in [0, 1]: the largest confidence, attenuated by distance and angle; 0 without a line
         within `REACH`.
         """
-        distance, index, found = self.near(points)
-        cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents))
-        turn = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
-        alike = np.exp(-0.5 * (distance / self.width) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
-        return np.asarray(np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1))
+        out = np.zeros(len(points))
+        for k in range(0, len(points), BLOCK):
+            part = slice(k, k + BLOCK)
+            distance, index, found = self.near(points[part])
+            cosine = np.abs(np.einsum("nki,ni->nk", self.lines.directions[index], tangents[part]))
+            turn = np.degrees(np.arccos(np.minimum(cosine, 1.0)))
+            alike = np.exp(-0.5 * (distance / self.width) ** 2 - 0.5 * (turn / ALIKE_DEG) ** 2)
+            out[part] = np.where(found, self.lines.confidence[index] * alike, 0.0).max(axis=1)
+        return out
 
 
 Surfaces = Sequence[tuple[Camera, Array]]

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.strands import Strands, unit_or_zero
-from reconstruction.growth.lines import GUESSED, REACH, Lines, Surfaces
+from reconstruction.growth.lines import BLOCK, GUESSED, REACH, Lines, Surfaces
 from reconstruction.growth.selection import select_by_coverage, without_exposed_ends
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
@@ -179,47 +179,51 @@ def gauss_newton_step(strands: Strands, start: Strands, lines: Lines, guesses: G
 
 def _hold_to_lines(x: Array, tangents: Array, lines: Lines, own: Array, right: Array) -> None:
     """Each line against its nearest point of compatible tangent, across the line."""
-    p, d, c = lines.lines.points, lines.lines.directions, lines.lines.confidence
     tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
     reach = REACH * lines.width
-    distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=reach, workers=-1)
-    found = np.isfinite(distance)
-    index = np.where(found, index, 0)
-    alike = found & (np.abs(np.einsum("nki,ni->nk", tangents[index], d)) >= COMPATIBLE)
-    which = np.flatnonzero(alike.any(axis=1))
-    i = index[which, alike[which].argmax(axis=1)]
-    across = np.eye(3) - d[which, :, None] * d[which, None, :]
-    offset = np.einsum("nij,nj->ni", across, p[which] - x[i])
-    # Geman-McClure: lines widths away belong to another strand
-    deviation = POINT_DEVIATION * lines.width
-    far = (offset**2).sum(axis=1) / (3 * deviation) ** 2
-    weight = c[which] / deviation**2 / (1 + far) ** 2
-    np.add.at(own, i, weight[:, None, None] * across)
-    np.add.at(right, i, weight[:, None] * offset)
+    for k in range(0, len(lines.lines.points), BLOCK):
+        some = lines.lines.where(slice(k, k + BLOCK))
+        p, d, c = some.points, some.directions, some.confidence
+        distance, index = tree.query(p, k=np.arange(1, 9), distance_upper_bound=reach, workers=-1)
+        found = np.isfinite(distance)
+        index = np.where(found, index, 0)
+        alike = found & (np.abs(np.einsum("nki,ni->nk", tangents[index], d)) >= COMPATIBLE)
+        which = np.flatnonzero(alike.any(axis=1))
+        i = index[which, alike[which].argmax(axis=1)]
+        across = np.eye(3) - d[which, :, None] * d[which, None, :]
+        offset = np.einsum("nij,nj->ni", across, p[which] - x[i])
+        # Geman-McClure: lines widths away belong to another strand
+        deviation = POINT_DEVIATION * lines.width
+        far = (offset**2).sum(axis=1) / (3 * deviation) ** 2
+        weight = c[which] / deviation**2 / (1 + far) ** 2
+        np.add.at(own, i, weight[:, None, None] * across)
+        np.add.at(right, i, weight[:, None] * offset)
 
 
 def _turn_to_lines(
     x: Array, tangents: Array, lines: Lines, starts: Bools, diagonal: Array, right: Array
 ) -> None:
     """Each segment against the mean direction of the compatible lines around it."""
-    i = np.flatnonzero(starts)
-    step = x[i + 1] - x[i]
-    length = np.linalg.norm(step, axis=1)
-    along = unit_or_zero(step)
-    distance, index, found = lines.near(0.5 * (x[i] + x[i + 1]))
-    d = lines.lines.directions[index]
-    cosine = np.einsum("nki,ni->nk", d, along)
-    near = np.exp(-0.5 * (distance / lines.width) ** 2) * lines.lines.confidence[index] ** 2
-    weight = np.where(found & (np.abs(cosine) >= COMPATIBLE), near, 0.0)
-    mean = unit_or_zero(np.einsum("nk,nki->ni", weight * np.sign(cosine), d))
-    total = weight.sum(axis=1) / np.maximum(length * ANGLE_DEVIATION, 1e-9) ** 2
-    wanted = total[:, None] * (length[:, None] * mean - step)
-    block = total[:, None, None] * np.eye(3)
-    diagonal[0][i] += block
-    diagonal[0][i + 1] += block
-    diagonal[1][i] -= block
-    right[i] -= wanted
-    right[i + 1] += wanted
+    every = np.flatnonzero(starts)
+    for k in range(0, len(every), BLOCK):
+        i = every[k : k + BLOCK]
+        step = x[i + 1] - x[i]
+        length = np.linalg.norm(step, axis=1)
+        along = unit_or_zero(step)
+        distance, index, found = lines.near(0.5 * (x[i] + x[i + 1]))
+        d = lines.lines.directions[index]
+        cosine = np.einsum("nki,ni->nk", d, along)
+        near = np.exp(-0.5 * (distance / lines.width) ** 2) * lines.lines.confidence[index] ** 2
+        weight = np.where(found & (np.abs(cosine) >= COMPATIBLE), near, 0.0)
+        mean = unit_or_zero(np.einsum("nk,nki->ni", weight * np.sign(cosine), d))
+        total = weight.sum(axis=1) / np.maximum(length * ANGLE_DEVIATION, 1e-9) ** 2
+        wanted = total[:, None] * (length[:, None] * mean - step)
+        block = total[:, None, None] * np.eye(3)
+        diagonal[0][i] += block
+        diagonal[0][i + 1] += block
+        diagonal[1][i] -= block
+        right[i] -= wanted
+        right[i + 1] += wanted
 
 
 def _hide(x: Array, guesses: Guesses, own: Array, right: Array) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Ints
-from reconstruction.geometry.strands import Strands
-from reconstruction.growth.lines import GUESSED, Lines, Surfaces
+from reconstruction.geometry.strands import Resampling, Strands
+from reconstruction.growth.lines import BLOCK, GUESSED, Lines, Surfaces
 from reconstruction.tangents.line_evidence import half_sphere, visible_from
 
 GUESS = 0.05  # coverage of a cell without measurement; 1 with the best
@@ -52,15 +53,14 @@ def select_by_coverage(
     by `GUESS` where no camera sees it. Lazy greedy selection: a strand's marginal coverage only
     falls.
     """
-    dense = strands.resampled(lines.width)
-    tangents = dense.tangents()
-    hidden = ~exposed(dense.points, surfaces, lines.width)
-    value = GUESS * hidden + lines.support(dense.points, tangents)
-    cells = _cells(dense.points, tangents, lines.width)
-    best = np.zeros(int(cells.max(initial=-1)) + 1)
-    ends = dense.offsets
-    own = [_mean_by(cells[a:b], value[a:b]) for a, b in pairwise(ends)]
-    count = np.diff(ends)
+    if not len(strands):
+        return np.zeros(0, bool)
+    count = np.diff(Resampling(strands, lines.width).offsets)
+    own = [mean for part in _parts(strands, count) for mean in _by_cell(part, lines, surfaces)]
+    cells, number = np.unique(np.concatenate([cell for cell, _ in own]), return_inverse=True)
+    numbers = np.split(number.ravel(), np.cumsum([len(cell) for cell, _ in own])[:-1])
+    own = [(cell, value) for cell, (_, value) in zip(numbers, own, strict=True)]
+    best = np.zeros(len(cells))
 
     def gain(i: int) -> float:
         cell, there = own[i]
@@ -83,14 +83,29 @@ def select_by_coverage(
     return kept
 
 
+def _parts(strands: Strands, count: Ints) -> Iterator[Strands]:
+    """Neighbouring strands with about `BLOCK` points, of `count (S,)` points each."""
+    part = np.cumsum(count) // BLOCK
+    for k in np.unique(part):
+        yield strands.subset(part == k)
+
+
+def _by_cell(strands: Strands, lines: Lines, surfaces: Surfaces) -> list[tuple[Ints, Array]]:
+    """The cells that each strand lies in, and their coverage by it."""
+    dense = strands.resampled(lines.width)
+    tangents = dense.tangents()
+    hidden = ~exposed(dense.points, surfaces, lines.width)
+    value = GUESS * hidden + lines.support(dense.points, tangents)
+    cells = _cells(dense.points, tangents, lines.width)
+    return [_mean_by(cells[a:b], value[a:b]) for a, b in pairwise(dense.offsets)]
+
+
 def _cells(points: AnyFloats, tangents: AnyFloats, width: float) -> Ints:
-    """Numbers `(N,)`, from 0 on, of the cells of place and direction that points lie in."""
+    """Numbers `(N,)` of the cells of place and direction that points lie in, up to 2^17 widths from
+    the origin."""
     heading = np.abs(tangents @ half_sphere(HEADINGS).T.astype(np.float32)).argmax(axis=1)
-    place = np.floor(points / width).astype(np.int64)
-    place -= place.min(axis=0, initial=0)
-    size = place.max(axis=0, initial=0) + 1
-    flat = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * HEADINGS + heading
-    return np.unique(flat, return_inverse=True)[1].ravel().astype(np.int64)
+    x, y, z = np.floor(points / width).astype(np.int64).T + (1 << 17)
+    return np.asarray(((x << 36 | y << 18 | z) * HEADINGS) + heading)
 
 
 def _mean_by(cells: Ints, value: Array) -> tuple[Ints, Array]:

@@ -57,7 +57,7 @@ class Measured:
         """No line at all."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
-    def where(self, keep: Bools) -> Measured:
+    def where(self, keep: Bools | slice) -> Measured:
         """The lines where `keep (N,)`."""
         return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
 
