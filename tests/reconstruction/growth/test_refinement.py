@@ -107,6 +107,16 @@ def test_directions_that_are_off_together_do_not_carry_strands_away() -> None:
     assert errors(made)[0] < 0.9 * errors(start)[0]
 
 
+def test_the_size_of_blocks_does_not_change_the_strands(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, noisy = strands(6, 2e-4), lines(3e-4, 10.0)
+    whole, _ = refine(start, noisy, RefineOptions())
+    for room in ("lines", "selection", "refinement"):
+        monkeypatch.setattr(f"reconstruction.growth.{room}.BLOCK", 50)
+    made, _ = refine(start, noisy, RefineOptions())
+    np.testing.assert_array_equal(made.offsets, whole.offsets)
+    np.testing.assert_allclose(made.points, whole.points, atol=1e-7)
+
+
 def test_copies_and_strands_across_the_measured_ones_go() -> None:
     many = strands(6, 1e-4)
     across = [np.linspace([-5e-3, 2e-3, z], [13e-3, 2e-3, z], 10) for z in (0.01, 0.03)]
