@@ -32,7 +32,7 @@ from reconstruction.pipeline import FINE_PIXEL, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent
 from reconstruction.stages import method_for
-from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS
+from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS, MOST_POINTS
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
 
 KNOWN_TASK = 0.0155
@@ -223,7 +223,8 @@ class _Probe:
         sphere = 4 * self.hair / len(self.cameras) * self.pixel**2  # of the same outline
         deep = SWEPT if self.capture.of_kind("scanline") else UNSWEPT
         most = deep * sphere / self.scale.thin**2
-        return most * (1 - float(np.exp(-0.7 * self.hair / most)))
+        every = most * (1 - float(np.exp(-0.7 * self.hair / most)))
+        return every if self.options.measure.thin else min(every, MOST_POINTS)
 
     @cached_property
     def volume(self) -> float:
@@ -328,7 +329,7 @@ class _Probe:
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
         images = self.pixels * (5 * lights + 8 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
         views = 0.7 + 0.3 * len(self.cameras)  # that see a point
-        scores, observed = 4 * CANDIDATES * n, views * n * reads * 24
+        scores, observed = 4 * CANDIDATES * n, views * n * reads * 5
         part = 0.35e9 * min(n / 2e4, 1.0)  # of scores being decided
         times = 8 if reads else 4.4  # halves of both kinds, sums and averages
         add("orientation", measured, table, max(images, times * scores + part + observed) / GB)

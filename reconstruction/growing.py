@@ -9,7 +9,6 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array
 from reconstruction.capture.records import CaptureError
-from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
@@ -138,7 +137,6 @@ class GrowingStages(Stages):
         cloud: PointCloud,
         cameras: Sequence[Camera],
         depths: Mapping[str, Array],
-        scale: CaptureScale,
     ) -> Strands:
         """Strands refined jointly by the `measured` lines, if there is a sweep.
 
@@ -159,7 +157,7 @@ class GrowingStages(Stages):
                 return strands
             self.progress("refining strands", 0.0)
             surfaces = [(camera, depths[camera.name]) for camera in cameras]
-            strands, figures = refine(strands, lines, o, surfaces, scale.thin)
+            strands, figures = refine(strands, lines, o, surfaces, lines.apart)
             stage.figures.update(figures)
         return strands
 

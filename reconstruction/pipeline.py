@@ -134,7 +134,7 @@ class _Run:
             scale = measuring.scale(masked, cloud, head)
             envelope, depths = measuring.envelope(masked, cloud, head.mesh, scale)
             measured = measuring.tangents(masked, cloud, depths, scale)
-            polylines, lines = measuring.surface(measured, cloud, scale), measured
+            polylines, lines = measuring.surface(measured, cloud), measured
             if method == "fused":
                 more, segments = measuring.lines(masked, head, "photometric")
                 polylines += more
@@ -143,7 +143,7 @@ class _Run:
             scalp = find_scalp(head.mesh, envelope)
             field = growing.field(envelope, measured, scalp)
             grown = growing.grown(field, scalp, polylines, options.within)
-            strands = growing.refined(grown.strands, measured, cloud, masked.cameras, depths, scale)
+            strands = growing.refined(grown.strands, measured, cloud, masked.cameras, depths)
             growing.rooted(strands, lines, scalp if grown.rooted else None, head.scalp_map)
 
     def line_stereo(
@@ -202,9 +202,7 @@ class _Run:
         within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
             grown = self.growing.grown(field, scalp, polylines, within)
-            strands = self.growing.refined(
-                grown.strands, measured, cloud, masked.cameras, depths, scale
-            )
+            strands = self.growing.refined(grown.strands, measured, cloud, masked.cameras, depths)
             self.growing.rooted(strands, written, scalp if grown.rooted else None, head.scalp_map)
             return
         with report.stage("strands") as stage:

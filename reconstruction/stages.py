@@ -206,9 +206,7 @@ class MeasuringStages(Stages):
                 masked, cloud.points, depths, scale, self.options.measure, stage, self.progress
             )
 
-    def surface(
-        self, measured: Measured, cloud: PointCloud, scale: CaptureScale
-    ) -> list[AnyFloats]:
+    def surface(self, measured: Measured, cloud: PointCloud) -> list[AnyFloats]:
         """Unrooted polylines `(N, 3)` through the measured lines."""
         with self.report.stage("surface") as stage:
             if not len(cloud):
@@ -220,7 +218,7 @@ class MeasuringStages(Stages):
                 return []
             self.progress("tracing the surface", 0.0)
             o = self.options
-            surface = SurfaceOptions(apart=scale.thin, longest=o.max_length)
+            surface = SurfaceOptions(apart=measured.apart, longest=o.max_length)
             good = measured.where(measured.confidence >= LEAST_CONFIDENCE)
             polylines = surface_strands(good, surface, seed=o.seed)
             stage.figures.update(strands=len(polylines), options=asdict(surface))

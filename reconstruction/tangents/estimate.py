@@ -40,17 +40,24 @@ from reconstruction.tangents.reflection import (
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
 TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
+MOST_POINTS = 250_000
+"""At most so many points have directions: their scores and responses take about 6 GB under 331
+lights in 16 cameras, beside a sweep's points."""
 ROUNDS = 2  # of the reflection table, filled from the directions of the round before
 LIGHT_GROUPS = 24  # groups of neighbouring lights, each with a texture of its own
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Lines at surface points: `points (N, 3)`, `directions (N, 3)`, `confidence (N,)`."""
+    """Lines at surface points: `points (N, 3)`, `directions (N, 3)`, `confidence (N,)`.
+
+    Neighbours are about `apart` metres from one another; inf: unknown.
+    """
 
     points: Array
     directions: Array
     confidence: Array
+    apart: float = np.inf
 
     @classmethod
     def none(cls) -> Measured:
@@ -59,7 +66,8 @@ class Measured:
 
     def where(self, keep: Bools | slice) -> Measured:
         """The lines where `keep (N,)`."""
-        return Measured(self.points[keep], self.directions[keep], self.confidence[keep])
+        kept = self.points[keep], self.directions[keep], self.confidence[keep]
+        return Measured(*kept, self.apart)
 
 
 def light_groups(lights: list[Light], count: int) -> Ints:
@@ -153,7 +161,16 @@ def measure_tangents(
     if not len(points):
         lifted = [_lifted(*view) for view in zip(cameras, shown, strict=True)]
         points = np.concatenate(lifted) if lifted else points
-    points, visible = _visible(thinned(points, scale.thin), cameras, shown, scale.tolerance)
+    points, apart = at_most(
+        MOST_POINTS if options.thin is None else len(points), points, scale.thin
+    )
+    if apart > scale.thin:
+        stage.leave_out(
+            f"directions {1e3 * scale.thin:.2g} mm apart, as the pixels resolve",
+            f"more than {MOST_POINTS:,} points take more than 12 GB",
+            f"memory; directions are {1e3 * apart:.2g} mm apart. Option: measure.thin",
+        )
+    points, visible = _visible(points, cameras, shown, scale.tolerance)
     if not len(points):
         raise CaptureError(f"{capture.path}: no surface point lies on a hair mask")
     reads = len(lights) >= FEWEST_LIGHTS
@@ -176,7 +193,7 @@ def measure_tangents(
     saturation.record(stage)
     stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
     given = (options.radius, options.reflection_weight)
-    found = chosen(points, scale.thin, halves, None, *given)
+    found = chosen(points, apart, halves, None, *given)
     stage.figures["texture_radius_mm"] = 1e3 * found.radius
     scores = halves.sum(axis=0)
     tangents = decide(pool(points, found.radius, options.neighbours) @ scores, candidates)
@@ -194,7 +211,7 @@ def measure_tangents(
             more = np.zeros_like(halves)
             for k, o in enumerate(observations):
                 more[k % 2, o.index] += table.scores(o, points, candidates)
-            found = chosen(points, scale.thin, halves, more, *given)
+            found = chosen(points, apart, halves, more, *given)
             near = pool(points, found.radius, options.neighbours)
             total = more.sum(axis=0)
             total *= np.float32(found.weight)
@@ -212,12 +229,13 @@ def measure_tangents(
             )
     stage.figures.update(
         points=len(points),
+        apart_mm=1e3 * apart,
         cameras_per_point={
             str(k): int(n) for k, n in enumerate(np.bincount(visible.sum(axis=1))) if n
         },
         confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)},
     )
-    return Measured(points, tangents.directions, tangents.confidence)
+    return Measured(points, tangents.directions, tangents.confidence, apart)
 
 
 def _details(stack: OlatStack, mask: Bools, group: Ints, scale: float) -> Floats:
@@ -274,3 +292,12 @@ def thinned(points: Array, spacing: float) -> Array:
     member = member.ravel()
     sums = np.stack([np.bincount(member, p, len(count)) for p in points.T], axis=1)
     return np.asarray(sums / count[:, None])
+
+
+def at_most(count: int, points: Array, spacing: float) -> tuple[Array, float]:
+    """`thinned` points `(M, 3)`, M <= `count`, and their spacing: at least `spacing` metres."""
+    found = thinned(points, spacing)
+    while len(found) > count:
+        spacing *= max(1.05, (len(found) / count) ** 0.5)
+        found = thinned(points, spacing)
+    return found, spacing

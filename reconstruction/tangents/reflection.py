@@ -26,6 +26,7 @@ _GRAZING = 0.1
 _BRIGHTEST = 6.0
 _BLOCK = 0.03
 _MOST_ALIKE = 0.99  # correlation, limited by the error of the table
+_TOGETHER = 1 << 13  # points whose vectors to all lights are in memory at once
 _TRUSTED = 0.4  # of the points, the most confident ones
 
 
@@ -64,17 +65,31 @@ class Observations:
     """One camera's OLAT responses at its visible points.
 
     `index (P,)` into the points; `response (P, L)`, corrected for the light's distance and
-    intensity and divided by the mean over the lights in front; `known (P, L)`; unit vectors
-    `to_light (P, L, 3)` and `to_camera (P, 3)`; `facing (P, L)` the cosines of the lights to the
-    surface's normal.
+    intensity and divided by the mean over the lights in front; `known (P, L)`; metres of
+    `points (P, 3)` and `lights (L, 3)`; unit vectors `normals (P, 3)` and `to_camera (P, 3)`.
     """
 
     index: Ints
     response: Floats
     known: Bools
-    to_light: Floats
+    points: Array
+    normals: Array
+    lights: Array
     to_camera: Floats
-    facing: Floats
+
+    def towards(self, some: Ints | slice) -> tuple[Floats, Floats]:
+        """Unit vectors to the lights `(Q, L, 3)` at `some` points, and their cosines to the normals
+        `(Q, L)`; four times the memory of the responses."""
+        away = self.lights - self.points[some][:, None]
+        to_light = away / np.sqrt((away**2).sum(axis=2))[..., None]
+        to_light = to_light.astype(np.float32)
+        normals = self.normals[some].astype(np.float32)
+        return to_light, np.einsum("pld,pd->pl", to_light, normals)
+
+    @property
+    def parts(self) -> list[slice]:
+        """All points, `_TOGETHER` at once."""
+        return [slice(k, k + _TOGETHER) for k in range(0, len(self.index), _TOGETHER)]
 
 
 def observe(
@@ -85,34 +100,35 @@ def observe(
     visible: Bools,
 ) -> Observations:
     """Responses of a camera under each light at those of `points (N, 3)` `visible (N,)` in it."""
-    camera = stack.camera
-    index = np.flatnonzero(visible)
-    pixels, _ = camera.project(points[index])
-    x, y = np.rint(pixels).astype(int).T
-    away = np.stack([light.position for light in lights])[None] - points[index][:, None]
-    square = (away**2).sum(axis=2)
-    to_light = (away / np.sqrt(square)[..., None]).astype(np.float32)
-    strength = np.stack([x.intensity_towards(points[index]).mean(axis=-1) for x in lights], axis=1)
-    shines = strength > 0  # frames of a dark light are noise
-    known = stack.known[:, y, x].T & shines
-    response = np.maximum(stack.olat[:, y, x].T, 0) * square
-    response = np.divide(response, strength, out=np.zeros_like(response), where=shines)
-    facing = np.einsum("pld,pd->pl", to_light, normals[index].astype(np.float32))
-    front = (facing > _GRAZING) & known
-    mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
-    response = response / np.maximum(mean, 1e-30)[:, None]
-    # responses are clipped at `_BRIGHTEST`: a brighter saturated one is as good as known
-    known |= (response >= _BRIGHTEST) & stack.shot
+    camera, index = stack.camera, np.flatnonzero(visible)
     to_camera = camera.center - points[index]
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    return Observations(
+    out = Observations(
         index,
-        np.minimum(response, _BRIGHTEST).astype(np.float32),
-        known,
-        to_light,
+        np.zeros((len(index), len(lights)), np.float32),
+        np.zeros((len(index), len(lights)), bool),
+        points[index],
+        normals[index],
+        np.stack([light.position for light in lights]),
         to_camera.astype(np.float32),
-        facing,
     )
+    pixels, _ = camera.project(out.points)
+    for part in out.parts:
+        x, y = np.rint(pixels[part]).astype(int).T
+        at = out.points[part]
+        square = ((out.lights - at[:, None]) ** 2).sum(axis=2)
+        strength = np.stack([x.intensity_towards(at).mean(axis=-1) for x in lights], axis=1)
+        shines = strength > 0  # frames of a dark light are noise
+        known = stack.known[:, y, x].T & shines
+        response = np.maximum(stack.olat[:, y, x].T, 0) * square
+        response = np.divide(response, strength, out=np.zeros_like(response), where=shines)
+        front = (out.towards(part)[1] > _GRAZING) & known
+        mean = (response * front).sum(axis=1) / np.maximum(front.sum(axis=1), 1)
+        response = response / np.maximum(mean, 1e-30)[:, None]
+        # responses are clipped at `_BRIGHTEST`: a brighter saturated one is as good as known
+        out.known[part] = known | ((response >= _BRIGHTEST) & stack.shot)
+        out.response[part] = np.minimum(response, _BRIGHTEST)
+    return out
 
 
 def _cell(sin_i: Floats, sin_r: Floats, cos_between: Floats) -> Ints:
@@ -148,23 +164,28 @@ class Reflection:
         """Fill the table from the `trusted (N,)` ones of `directions (N, 3)`."""
         total, count = np.zeros(_FACINGS), np.zeros(_FACINGS)
         for o in observations:
-            cell = _facing_cell(o.facing)[o.known]
-            total += np.bincount(cell, o.response[o.known], _FACINGS)
-            count += np.bincount(cell, minlength=_FACINGS)
+            for part in o.parts:
+                known = o.known[part]
+                cell = _facing_cell(o.towards(part)[1])[known]
+                total += np.bincount(cell, o.response[part][known], _FACINGS)
+                count += np.bincount(cell, minlength=_FACINGS)
         lit = np.maximum((total + 1e-3) / (count + 1e-3), 1e-3)
         size = _SUMS * _AZIMUTHS * _TILTS
         total, count = np.zeros(size), np.zeros(size)
         for o in observations:
-            m = trusted[o.index]
-            t = directions[o.index[m]].astype(np.float32)
-            sin_i = np.einsum("pld,pd->pl", o.to_light[m], t)
-            sin_r = (o.to_camera[m] * t).sum(axis=1, keepdims=True)
-            between = np.einsum("pld,pd->pl", o.to_light[m], o.to_camera[m])
-            cell = _cell(sin_i, sin_r, between)
-            front = (o.facing[m] > _GRAZING) & o.known[m]
-            ratio = np.minimum(o.response[m] / lit[_facing_cell(o.facing[m])], _BRIGHTEST)
-            total += np.bincount(cell[front], ratio[front], size)
-            count += np.bincount(cell[front], minlength=size)
+            every = np.flatnonzero(trusted[o.index])
+            for k in range(0, len(every), _TOGETHER):
+                m = every[k : k + _TOGETHER]
+                t = directions[o.index[m]].astype(np.float32)
+                to_light, facing = o.towards(m)
+                sin_i = np.einsum("pld,pd->pl", to_light, t)
+                sin_r = (o.to_camera[m] * t).sum(axis=1, keepdims=True)
+                between = np.einsum("pld,pd->pl", to_light, o.to_camera[m])
+                cell = _cell(sin_i, sin_r, between)
+                front = (facing > _GRAZING) & o.known[m]
+                ratio = np.minimum(o.response[m] / lit[_facing_cell(facing)], _BRIGHTEST)
+                total += np.bincount(cell[front], ratio[front], size)
+                count += np.bincount(cell[front], minlength=size)
         return cls(lit, (total + 1) / (count + 1))
 
     @property
@@ -184,22 +205,20 @@ class Reflection:
         out = np.zeros((len(o.index), len(candidates)), np.float32)
         model = np.sqrt(self.lobe).astype(np.float32)
         c = candidates.astype(np.float32)
-        weight = np.where((o.facing > _GRAZING) & o.known, self.lit[_facing_cell(o.facing)], 0)
-        measured = np.sqrt(
-            np.minimum(o.response / self.lit[_facing_cell(o.facing)], _BRIGHTEST)
-        ).astype(np.float32)
-        weight = weight.astype(np.float32)
         cell = np.floor(points[o.index] / _BLOCK).astype(np.int64)
         _, block = np.unique(cell, axis=0, return_inverse=True)
         order = np.argsort(block.ravel(), kind="stable")
         for m in np.split(order, np.flatnonzero(np.diff(block.ravel()[order])) + 1):
-            to_light = o.to_light[m].mean(axis=0)
+            each, facing = o.towards(m)
+            lit = self.lit[_facing_cell(facing)]
+            w = np.where((facing > _GRAZING) & o.known[m], lit, 0).astype(np.float32)
+            y = np.sqrt(np.minimum(o.response[m] / lit, _BRIGHTEST)).astype(np.float32)
+            to_light = each.mean(axis=0)
             to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
             to_camera = o.to_camera[m].mean(axis=0)
             to_camera /= np.linalg.norm(to_camera)
             sin_i, sin_r = to_light @ c.T, (c @ to_camera)[None]
             predicted = model[_cell(sin_i, sin_r, (to_light @ to_camera)[:, None])]
-            w, y = weight[m], measured[m]
             total = w.sum(axis=1, keepdims=True) + 1e-9
             y = y - (w * y).sum(axis=1, keepdims=True) / total
             mean = (w @ predicted) / total

@@ -10,7 +10,7 @@ import pytest
 
 from reconstruction import Camera, Light
 from reconstruction.geometry.lights import dome_positions
-from reconstruction.tangents.estimate import _visible
+from reconstruction.tangents.estimate import _visible, at_most
 from reconstruction.tangents.line_evidence import (
     LineEvidence,
     Tangents,
@@ -269,7 +269,7 @@ def test_observations_undo_distance_and_intensity() -> None:
         visible,
     )
     np.testing.assert_allclose(o.response, 1, rtol=1e-5)
-    np.testing.assert_allclose(o.facing[0], cosines, rtol=1e-6)
+    np.testing.assert_allclose(o.towards(slice(None))[1][0], cosines, rtol=1e-6)
 
 
 def test_a_lamp_that_gives_no_light_says_nothing() -> None:
@@ -284,6 +284,19 @@ def test_a_lamp_that_gives_no_light_says_nothing() -> None:
     o = observe(stack, lights, point, normal, np.array([True]))
     assert o.known.tolist() == [[True, False]]
     assert o.response[0, 0] == pytest.approx(1)
+
+
+def test_more_points_than_fit_are_measured_further_apart() -> None:
+    """A square of 0.1 m: as many cells as the limit are 2 mm wide."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(0, 0.1, (200_000, 2)), np.zeros((200_000, 1))], axis=1)
+    found, apart = at_most(2_500, points, 1e-3)
+    assert len(found) <= 2_500
+    assert 2e-3 <= apart < 2.2e-3
+    found, apart = at_most(10_201, points, 1e-3)
+    assert apart == 1e-3
+    assert len(found) == pytest.approx(10_000, rel=1e-3)
+    assert at_most(0, np.zeros((0, 3)), 1e-3)[1] == 1e-3
 
 
 def test_a_flat_table_has_no_contrast() -> None:
