@@ -7,7 +7,7 @@ at the distance d and the angle θ to the normal. Its position follows from its 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -19,6 +19,8 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.lights import Light
 from reconstruction.options import options
 
+Circle = tuple[float, float, float]
+"""x, y and radius in pixels."""
 POINTS = 600
 """Sample points on the ball."""
 FACING, LIT = 0.6, 0.3
@@ -39,8 +41,19 @@ class GreyBall:
     pixel at (0, 0).
     """
 
-    circles: dict[str, tuple[float, float, float]]
+    circles: dict[str, Circle]
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.18
+
+
+@options
+class MirrorBalls:
+    """Mirror balls of one `radius` in metres and their outlines in each camera, as in `GreyBall`.
+
+    They are detected without `circles`; without a radius two cameras place a ball.
+    """
+
+    radius: Annotated[float, Field(gt=0)] | None = None
+    circles: dict[str, list[Circle]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

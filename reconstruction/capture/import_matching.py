@@ -21,7 +21,9 @@ from reconstruction.capture.import_settings import (
 from reconstruction.capture.light_patterns import LightPatterns
 from reconstruction.capture.records import Step, StepKind
 from reconstruction.files.encoded import FORMATS, RAW, PictureError
+from reconstruction.files.lights import light_name
 from reconstruction.files.pictures import LOSSY, exposure_of
+from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.rig import Rig
 
 Bracket = dict[float, Path]
@@ -129,6 +131,17 @@ def find(
         tuple(steps), frames, plates, single["flat"], single["hair"], single["subject"],
         tuple(left), (*bare, *_notes(rig, shot, used, settings, left), *reader.notes()),
     )  # fmt: skip
+
+
+def light_names(folder: Path, settings: ImportSettings, cameras: Sequence[Camera]) -> list[str]:
+    """What the images' names have for `{light}`, sorted, for a set without positions of lights."""
+    reader = _Names(Rig(folder.name, tuple(cameras), ()), settings, None)
+    names = {p.relative_to(folder).as_posix(): p for p in _files(folder)}
+    others = {f: p for f, p in vars(settings.pictures).items() if p and f != "olat"}
+    taken = {m.path for role, p in others.items() for m in reader.matching(role, p, names)}
+    expression = re.compile(reader.expression(settings.pictures.olat))
+    found = (expression.fullmatch(n) for n, p in names.items() if p not in taken)
+    return sorted({str(light_name(m["light"])) for m in found if m})
 
 
 def _first_of(
@@ -256,17 +269,20 @@ class _Names:
         alone = {f for f, names in given.items() if len(names) == 1}
         if missing := needed.get(role, {"camera"}) - fields - alone:
             raise ImportProblem(f"{where}: the fields {' and '.join(sorted(missing))} are required")
-        expression = re.compile(self._expression(pattern))
+        expression = re.compile(self.expression(pattern))
         found = ((path, expression.fullmatch(name)) for name, path in names.items())
         timed = role not in ("flat", "hair", "subject")
         read = [self._read(path, match.groupdict(), timed) for path, match in found if match]
         return [m for m in read if m is not None]
 
-    def _expression(self, pattern: str) -> str:
+    def expression(self, pattern: str) -> str:
+        """The regular expression of `pattern`."""
         number = r"\d+"
         kinds = {
             "camera": _any_of([*self.cameras, _numbered("cam(?:era)?", self.cameras)], 1),
-            "light": _any_of([*self.lights, _numbered("light", self.lights)], 1),
+            "light": _any_of([*self.lights, _numbered("light", self.lights)], 1)
+            if self.lights
+            else "[^/]+?",
             "pattern": _any_of([*self.patterns, _numbered("pattern", self.patterns)], 1),
             "projector": _any_of([*self.projectors, _numbered("proj", self.projectors)], 1),
             "exposure": _any_of(

@@ -7,7 +7,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
-from reconstruction.capture.grey_ball import GreyBall
+from reconstruction.capture.grey_ball import GreyBall, MirrorBalls
 from reconstruction.capture.import_geometry import GeometryFiles
 from reconstruction.capture.records import CaptureError
 from reconstruction.files.pictures import Positive, Sensor
@@ -71,6 +71,7 @@ class ImportSettings:
     `exposures` are named exposures. `first_light` is the number in a file name of the first light
     in the list; None: numbers are those at the end of the lights' names. `units` is whether a full
     channel at 1 s is `scale` W/(sr m²) or unknown; a `grey_ball` determines it instead of `scale`.
+    `mirror_balls` are those by which `import --targets` finds lights.
     `patterns` is a table of `reconstruction.capture.light_patterns`, by default the folder's
     patterns.csv or patterns.json; it and the files of cameras and lights, `geometry`, are relative
     to the folder.
@@ -84,6 +85,7 @@ class ImportSettings:
     units: Literal["radiance", "relative"] | None = None
     scale: Positive = 1.0
     grey_ball: GreyBall | None = None
+    mirror_balls: MirrorBalls = MirrorBalls()
     patterns: Path | None = None
     geometry: GeometryFiles = GeometryFiles()
 

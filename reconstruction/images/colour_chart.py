@@ -59,29 +59,39 @@ def find_chart(image: AnyFloats, saturated: Bools | None = None) -> Chart | None
     return None
 
 
-def find_ball(image: AnyFloats) -> tuple[float, float, float] | None:
-    """x, y and radius in pixels of the roundest outline in a linear `image (H, W, 3)`, or None.
+def find_balls(image: AnyFloats) -> list[tuple[float, float, float]]:
+    """x, y and radius in pixels of the round outlines in a linear `image (H, W, 3)`, best first.
 
     Detected by the gradients' directions (OpenCV, HOUGH_GRADIENT_ALT), then fitted to the steepest
-    points along rays from its centre.
+    points along rays from the centre. Outlines inside another one are left out.
     """
-    grey = cv2.cvtColor(_eight_bits(image, EXPOSURES[0]), cv2.COLOR_BGR2GRAY)
-    side = min(grey.shape)
-    found = cv2.HoughCircles(
-        cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.HOUGH_GRADIENT_ALT, 1.5, side / 4,
-        param1=200, param2=0.9, minRadius=max(6, side // 60), maxRadius=side // 3,
-    )  # fmt: skip
-    if found is None:
-        return None
-    x, y, radius = (float(v) for v in found.reshape(-1, found.shape[-1])[0][:3])
-    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.float32)
+    out: list[tuple[float, float, float]] = []
+    for white in EXPOSURES[:2]:
+        grey = cv2.cvtColor(_eight_bits(image, white), cv2.COLOR_BGR2GRAY)
+        grey, side = cv2.GaussianBlur(grey, (0, 0), 1.0), min(grey.shape)
+        found = cv2.HoughCircles(
+            grey, cv2.HOUGH_GRADIENT_ALT, 1.5, side / 8,
+            param1=200, param2=0.9, minRadius=max(6, side // 60), maxRadius=side // 3,
+        )  # fmt: skip
+        for x, y, radius in [] if found is None else found.reshape(-1, found.shape[-1])[:, :3]:
+            circle = _fitted(grey.astype(np.float32), float(x), float(y), float(radius))
+            if circle is None or any(np.hypot(circle[0] - a, circle[1] - b) < r for a, b, r in out):
+                continue
+            out.append(circle)
+    return out
+
+
+def _fitted(
+    grey: AnyFloats, x: float, y: float, radius: float
+) -> tuple[float, float, float] | None:
     angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     along = radius * np.arange(1 - RIM_SEARCH, 1 + RIM_SEARCH, 0.25 / radius)
     at_x, at_y = (c + np.outer(along, f(angle)) for c, f in ((x, np.cos), (y, np.sin)))
-    profile = cv2.remap(smooth, at_x.astype("f4"), at_y.astype("f4"), cv2.INTER_LINEAR)
+    whole = (at_x >= 0) & (at_x < grey.shape[1] - 1) & (at_y >= 0) & (at_y < grey.shape[0] - 1)
+    profile = cv2.remap(grey, at_x.astype("f4"), at_y.astype("f4"), cv2.INTER_LINEAR)
     steps = np.abs(np.diff(profile, axis=0))
     best, ray = steps.argmax(axis=0), np.arange(len(angle))
-    good = steps[best, ray] > 0.3 * np.median(steps[best, ray])
+    good = whole.all(axis=0) & (steps[best, ray] > 0.3 * np.median(steps[best, ray]))
     rim = along[best[good]] + 0.125
     points = np.stack([x + rim * np.cos(angle[good]), y + rim * np.sin(angle[good])], axis=1)
     if len(points) < FEWEST_RAYS:

@@ -43,8 +43,8 @@ def add(commands: Commands) -> None:
     imported.add_argument(
         "--targets",
         action="store_true",
-        help="with --dry-run: find a chart of 24 colours and a grey ball, draw them next to --out, "
-        "and print their lines for import.toml",
+        help="with --dry-run: find a chart of 24 colours, a grey ball, and lights by mirror balls; "
+        "draw them next to --out, and print their lines for import.toml",
     )
     imported.add_argument(
         "--cameras",
@@ -111,13 +111,13 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
     from reconstruction.capture.contact_sheet import contact_sheet
     from reconstruction.capture.writer import require_vacant
     from reconstruction.images.faint_parts import faint_warnings
-    from reconstruction.images.import_targets import find_targets
+    from reconstruction.images.import_targets import find_targets, write_lights
     from reconstruction.images.scene_checks import check_scene
     from reconstruction.light_planes.stabilising import lit_frames
 
     if args.targets and not args.dry_run:
         raise BadArgument("--targets needs --dry-run: it only proposes lines for import.toml")
-    understood, notes = _understood(args)
+    understood, notes, given = _understood(args)
     notes += understood.response.notes
     for note in notes:
         output.note(note)
@@ -130,11 +130,17 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
         lines, data = [*understood.summary(), f"{sheet}: contact sheet"], {}
         if args.targets:
             proof = out.with_name(f"{out.name}-targets.png")
-            targets = find_targets(understood, proof)
+            targets = find_targets(understood, proof, given)
             notes += targets.notes
             lines += [*targets.notes, f"{proof}: if its outlines are right, add to import.toml:"]
             lines.append(targets.toml or "nothing")
-            data = {"targets": str(proof), "toml": targets.toml}
+            data = {"targets": str(proof), "toml": targets.toml, "off_deg": targets.off_deg}
+            if not given:
+                lamps = out.with_name(f"{out.name}-lights.json")
+                count = write_lights(understood, targets.lights, args.light_distance, lamps)
+                found = f"{lamps}: {count} lights, for --lights"
+                missing = "no light's distance is determined: give --light-distance, or 2 balls"
+                lines.append(found if count else missing)
         counts = understood.counts()
         output.result({"sheet": str(sheet), **data, **counts, "notes": notes}, "\n".join(lines))
         return
@@ -206,14 +212,18 @@ def run_stabilise(args: argparse.Namespace, output: Output) -> None:
     output.result({"capture": str(found.capture.path), **data}, found.summary)
 
 
-def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
-    """The import of the folder, and notes for the user."""
+def _understood(args: argparse.Namespace) -> tuple[Import, list[str], bool]:
+    """The import of the folder, notes for the user, and whether the lights are given."""
     from dataclasses import replace
+
+    import numpy as np
 
     from reconstruction.capture.import_folder import Import, settings_of
     from reconstruction.capture.import_geometry import GeometryFiles, files_in, read_geometry
+    from reconstruction.capture.import_matching import light_names
     from reconstruction.capture.import_tables import own_geometry
     from reconstruction.capture.presets import PresetFiles, mean_light, read_preset, understood
+    from reconstruction.geometry.lights import Light
     from reconstruction.geometry.placement import PlacementOptions
     from reconstruction.options import parse_options
 
@@ -236,7 +246,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         settings, found = understood(take)
         settings = replace(settings, patterns=table)
         imported = Import.of(args.folder, take.geometry, settings, found)
-        return imported, [*take.geometry.notes, *imported.found.notes]
+        return imported, [*take.geometry.notes, *imported.found.notes], True
     settings = settings_of(args.folder, args.settings)
     configured = settings.geometry
     options = {f: getattr(args, f) for f in ("cameras", "lights")}
@@ -246,7 +256,7 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
     placement = {f: v for f, v in vars(configured.placement).items() if v is not None}
     named = {**vars(configured), **options, "placement": {**placement, **given}}
     files = files_in(args.folder, parse_options(GeometryFiles, named, "import"))
-    if files.light_distance is not None and files.lights is None:
+    if files.light_distance is not None and files.lights is None and not args.targets:
         raise BadArgument("--light-distance needs --lights; lights.json has positions")
     if files.cameras or (files.lights and not (args.folder / "cameras.json").is_file()):
         geometry = read_geometry(files)
@@ -259,8 +269,14 @@ def _understood(args: argparse.Namespace) -> tuple[Import, list[str]]:
         role = "pattern" if "{pattern}" in args.pictures else role
         patterns = replace(settings.pictures, **{role: args.pictures})
         settings = replace(settings, pictures=patterns)
+    have_lights = bool(geometry.lights) or table is not None
+    if args.targets and not have_lights:
+        cameras = list(geometry.cameras.values())
+        names = light_names(args.folder, settings, cameras)
+        lights = [Light(n, cameras[0].center, np.ones(3)) for n in names]  # to be found
+        geometry = replace(geometry, lights=lights)
     imported = Import.of(args.folder, geometry, settings)
-    return imported, [*geometry.notes, *imported.found.notes]
+    return imported, [*geometry.notes, *imported.found.notes], have_lights
 
 
 def _unit(text: str) -> str | float:

@@ -8,7 +8,7 @@ import pytest
 
 from reconstruction import import_folder, write_exr
 from reconstruction.capture.import_folder import Import, settings_of
-from reconstruction.images.colour_chart import PUBLISHED, find_ball, find_chart
+from reconstruction.images.colour_chart import PUBLISHED, find_balls, find_chart
 from reconstruction.images.import_targets import find_targets
 
 CAST = np.array([0.6, 1.0, 0.8])
@@ -67,12 +67,12 @@ def ball(x, y, radius, seed=0):
 
 @pytest.mark.parametrize("circle", [(200.3, 180.8, 15.4), (420.7, 250.2, 36.0), (300, 240, 87.3)])
 def test_a_ball_within_a_pixel(circle) -> None:
-    np.testing.assert_allclose(find_ball(ball(*circle)), circle, atol=1.0)
+    np.testing.assert_allclose(find_balls(ball(*circle)), [circle], atol=1.0)
 
 
 def test_no_ball() -> None:
-    assert find_ball(np.zeros((90, 120, 3), np.float32)) is None
-    assert find_ball(drawn(noise=0.0)) is None
+    assert find_balls(np.zeros((90, 120, 3), np.float32)) == []
+    assert find_balls(drawn(noise=0.0)) == []
 
 
 def test_targets_of_a_folder_become_its_settings(tmp_path) -> None:
