@@ -129,7 +129,8 @@ def turning_light(
         zip(*(spread_out(part, index, camera) for part in parts), strict=True)
     ):
         turned = np.roll(envmap, -round(envmap.shape[1] * k / frames), axis=1)
-        indirect = smoothed(indirect[None], share, sigma)[0] * mean_factor(scene, camera, turned)
+        factor = mean_factor(scene, camera, turned, index)
+        indirect = smoothed(indirect[None], share, sigma)[0] * factor
         out.append(without_rare(one, other, share, sigma) + indirect)
     return np.stack(out)
 

@@ -6,7 +6,8 @@ the nadir; the middle column is +x, and columns to its right turn clockwise from
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -40,7 +41,12 @@ from reconstruction import Camera
 from reconstruction.array_backend import for_kernels, rows_of
 from reconstruction.arrays import AnyFloats, Floats, Ints
 
-_GOLDEN = 0.6180339887498949
+CANDIDATES, DEEP = 8, 4
+"""Directions that one of a vertex's is chosen from; where only indirect light is."""
+PER_HIT = 2
+"""Directions of direct light at a first hit: shadows have more of the noise than hits."""
+_GOLDEN = 0x9E3779B9
+"""The golden ratio's fraction times 2³²."""
 
 
 def render_environment(
@@ -55,7 +61,7 @@ def render_environment(
     """Radiance `(H, W, 3)`, W/(sr m²), of the subject lit by `envmap (h, w, 3)` alone.
 
     `rotation_deg` turns the map counter-clockwise from above. Pixels off the subject are 0, or the
-    map with `background`. Each vertex samples one direction in proportion to the map's brightness.
+    map with `background`. Each vertex samples one direction (`Sky.resampled`).
     Raises `ValueError` for negative or infinite maps, `FloatingPointError` for infinite light.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), rotation_deg)
@@ -83,32 +89,66 @@ def render_environment(
 
 
 def direct_environment(
-    scene: HairScene, camera: Camera, envmap: AnyFloats, spp: int, seed: int = 0
+    scene: HairScene,
+    camera: Camera,
+    envmap: AnyFloats,
+    spp: int,
+    seed: int = 0,
+    *,
+    pixels: Ints | None = None,
 ) -> Floats:
     """`render_environment` to the first hit alone `(H, W, 3)`, its directions well spread.
 
-    A pixel's directions are a golden-ratio sequence on a curve through the map (`_along_curve`):
-    under half the noise of independent ones on smooth surfaces.
+    Of flat `pixels (P,)`, or of all that see the subject, with `PER_HIT` directions a hit. A
+    pixel's directions are a golden-ratio sequence on a curve through the map (`_along_curve`):
+    under half the noise of independent ones on smooth surfaces. Uniform fibres scatter the mean
+    over parts of their width.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
-    index = covered_pixels(scene, camera)
+    index = covered_pixels(scene, camera) if pixels is None else pixels
     if len(index):
-        film, surface = dr.zeros(mi.Float, 3 * len(index)), Surface(scene)
-        field = field_of(scene, camera, index)
+        film = dr.zeros(mi.Float, 3 * len(index))
+        field, surface = field_of(scene, camera, index), Surface(scene, mean_width=True)
         gather, origin = _Gather(surface, film, sky, factor_of(field)), seed_state(seed, 1)
 
         def trace(wave: Wave) -> None:
             si = surface.interact(wave.rays, mi.Bool(True))
-            start = stream_of(origin, mi.UInt64(wave.slot)).next_float32()
-            place = start + mi.Float(wave.sample) * _GOLDEN
+            place = stream_of(origin, mi.UInt64(wave.slot)).next_uint32()
             hit = Paths(mi.Color3f(1), mi.UInt32(0), wave.slot, wave.rng, si.is_valid())
-            gather.add(si, hit, place - dr.floor(place))
+            for k in range(PER_HIT):
+                gather.add(si, hit, place + (wave.sample * PER_HIT + k) * CANDIDATES * _GOLDEN)
 
-        pixels = mi.UInt32(for_kernels(index, np.uint32))
-        each_sample(camera, pixels, len(index), spp, seed, trace)
-        image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp)
+        each_sample(camera, mi.UInt32(for_kernels(index, np.uint32)), len(index), spp, seed, trace)
+        image[index] = np.array(film).reshape(len(index), 3) / np.float32(spp * PER_HIT)
         image[index] = _with_added(image[index], field, envmap, 0.0)
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def indirect_environment(
+    scene: HairScene, camera: Camera, envmap: AnyFloats, sampling: Sampling, pixels: Ints
+) -> Floats:
+    """`render_environment` from the second hit on, of flat `pixels (P,)`: `(H, W, 3)`.
+
+    Uniform fibres scatter the mean over parts of their width. A field that is all of the light has
+    none.
+    """
+    sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
+    image = np.zeros((camera.height * camera.width, 3), np.float32)
+
+    def render(some: Ints, plan: PathPlan) -> None:
+        film, field = dr.zeros(mi.Float, 3 * len(some)), field_of(scene, camera, some)
+        if field is not None and field.additive and field.alone:
+            return
+        gather = _Gather(Surface(scene, mean_width=True), film, sky, factor_of(field), DEEP)
+
+        def vertex(si: Any, paths: Paths) -> None:
+            gather(si, replace(paths, active=paths.active & (paths.depth > 0)))
+
+        follow(gather.surface, camera, some, plan, vertex)
+        image[some] = np.array(film).reshape(len(some), 3) / np.float32(plan.spp)
+
+    render_whole(camera, pixels, image, render, sampling.plan())
     return image.reshape(camera.height, camera.width, 3)
 
 
@@ -213,6 +253,42 @@ class Sky:
         value = dr.gather(mi.Color3f, self.texels, texel, active) * (solid_angle / chance)
         return mi.Vector3f(radius * cos, radius * sin, z), value
 
+    def resampled(
+        self,
+        si: Any,
+        scattered: Callable[[Any, Any], Any],
+        rng: Any,
+        active: Any,
+        count: int,
+        place: Any = None,
+    ) -> tuple[Any, Any]:
+        """A direction, and its light scattered at `si` divided by the density of the draw.
+
+        `scattered` is `Surface.towards` of `si`. Of `count` draws of `sample` one is kept, in
+        proportion to its scattered light: resampled importance sampling (Talbot et al. 2005). The
+        draws are at golden-ratio steps from `place` / 2³² on the curve; random where None.
+        """
+
+        def more(k: Any, *_: Any) -> Any:
+            return active & (k < draws)
+
+        def body(k: Any, kept: Any, colour: Any, total: Any, rng: Any) -> Any:
+            at = None if place is None else mi.Float(place + k * _GOLDEN >> 8) * 2**-24
+            direction, light = self.sample(rng, active, at)
+            value = scattered(si.to_local(direction), active) * light
+            size = dr.mean(value)
+            total = total + size
+            taken = rng.next_float32() * total < size
+            kept = dr.select(taken, direction, kept)
+            colour = dr.select(taken, value / size, colour)
+            return k + 1, kept, colour, total, rng
+
+        width, draws = dr.width(active), opaque_index(count)
+        start = (dr.zeros(mi.UInt32, width), mi.Vector3f(0, 0, 1), mi.Color3f(0), mi.Float(0), rng)
+        _, kept, colour, total, after = dr.while_loop(start, more, body, label="candidates")
+        rng.state = after.state
+        return kept, colour * (total / mi.Float(draws))
+
 
 @dataclass(frozen=True)
 class _Gather:
@@ -222,17 +298,18 @@ class _Gather:
     film: Any
     sky: Sky
     factor: DeviceField | None
+    count: int = CANDIDATES
 
     def __call__(self, si: Any, paths: Paths) -> None:
         self.add(si, paths)
 
     def add(self, si: Any, paths: Paths, place: Any = None) -> None:
-        """Add the light from the direction at `place` of the sky's curve; random where None."""
-        towards, light = self.sky.sample(paths.rng, paths.active, place)
-        answer = self.surface.eval(si, si.to_local(towards), paths.active)
-        value = paths.throughput * light * answer
+        """Add the light from one direction; see `Sky.resampled` for `place`."""
+        active, scattered = paths.active, self.surface.towards(si, paths.active)
+        towards, value = self.sky.resampled(si, scattered, paths.rng, active, self.count, place)
+        value = value * paths.throughput
         if self.factor is not None:
-            value = value * self.factor.towards(paths.slot, towards, paths.active)
-        lit = paths.active & (dr.max(value) > 0)
+            value = value * self.factor.towards(paths.slot, towards, active)
+        lit = active & (dr.max(value) > 0)
         lit &= ~self.surface.scene.occluded(si.spawn_ray(towards), lit)
         add_light(self.film, value, paths.slot * 3, lit)

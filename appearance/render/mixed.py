@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.render.coverage import covered_pixels
-from appearance.render.environment import Sky
+from appearance.render.environment import CANDIDATES, Sky
 from appearance.render.environment_maps import check_environment
 from appearance.render.harmonics import projected
 from appearance.render.lights import PackedLights
@@ -147,7 +147,8 @@ class _Gather:
     factor: DeviceField | None
 
     def __call__(self, si: Any, paths: Paths) -> None:
-        throughput, rng, active = paths.throughput, paths.rng, paths.active
+        rng, active = paths.rng, paths.active
+        surface = self.surface.towards(si, active)
         if self.bank is not None:
             light = self.choice.sample(rng.next_float32(), active)
             # the bank's intensities are divided by the probability of the choice
@@ -155,14 +156,13 @@ class _Gather:
             towards = target - si.p
             squared = dr.squared_norm(towards)
             wo = si.to_local(towards * dr.rsqrt(squared))
-            value = throughput * self.surface.eval(si, wo, active) * (intensity / squared)
+            value = paths.throughput * surface(wo, active) * (intensity / squared)
             if self.factor is not None:
                 value = value * self.factor.at(paths.slot, target, active)
             self._add(value, si.spawn_ray_to(target), paths)
         for sky, weight in self.skies:
-            direction, radiance = sky.sample(rng, active)
-            value = throughput * self.surface.eval(si, si.to_local(direction), active)
-            value = value * radiance * mi.Color3f(*opaque(weight))
+            direction, value = sky.resampled(si, surface, rng, active, CANDIDATES)
+            value = paths.throughput * value * mi.Color3f(*opaque(weight))
             if self.factor is not None:
                 value = value * self.factor.towards(paths.slot, direction, active)
             self._add(value, si.spawn_ray(direction), paths)

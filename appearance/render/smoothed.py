@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from appearance.render.coverage import coverage, covered_pixels
-from appearance.render.environment import direct_environment, render_environment
+from appearance.render.coverage import coverage
+from appearance.render.environment import direct_environment, indirect_environment
 from appearance.render.harmonics import projected
 from appearance.render.olat import render_direct, render_indirect, spread_out
 from appearance.render.paths import Surface, pixel_indices
@@ -23,7 +23,7 @@ from appearance.render.pixel_field import field_of
 from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
-from reconstruction.arrays import AnyFloats, Floats
+from reconstruction.arrays import AnyFloats, Floats, Ints
 
 SIGMA = 1.25
 """Standard deviation, pixels, of the filter of indirect light."""
@@ -38,7 +38,7 @@ DIRECT, DIRECT_OF_MEANS = 64, 36
 where fibres scatter the mean over parts of their width."""
 THRIFT = 6.0
 """`OlatOptions.thrift` of indirect light: 0.1 dB less than at 3, for a fifth less time."""
-_DIRECT_OF_MAPS = 12
+_DIRECT_OF_MAPS = 6
 SHOWN = Sampling(36, 16)
 
 
@@ -92,27 +92,27 @@ def environment_smoothed(
     """
     spp, seed = sampling.spp, sampling.seed
     share = coverage(scene, camera, max(spp, 16), seed)
-    first, whole = (
-        render_environment(scene, camera, envmap, replace(sampling, max_depth=depth))
-        for depth in (1, sampling.max_depth)
+    index = np.flatnonzero((share["hair"] + share["head"]).ravel() > 0)
+    indirect = indirect_environment(scene, camera, envmap, sampling, index)
+    half = _DIRECT_OF_MAPS * spp // 2
+    one, other = (
+        direct_environment(scene, camera, envmap, half, 2 * seed + k, pixels=index) for k in (1, 2)
     )
-    half = -(-_DIRECT_OF_MAPS * spp // 2)
-    one, other = (direct_environment(scene, camera, envmap, half, 2 * seed + k) for k in (1, 2))
     sigma = max(SIGMA, camera.width / 160)
-    factor = mean_factor(scene, camera, envmap)
     # a field has the detail of single strands: what is smooth is the light without it
-    indirect = smoothed(((whole - first) / factor)[None], share, sigma)[0]
-    return np.asarray(without_rare(one, other, share, sigma) + factor * indirect)
+    factor = mean_factor(scene, camera, envmap, index)
+    smooth = smoothed((indirect / factor)[None], share, sigma)[0]
+    return np.asarray(without_rare(one, other, share, sigma) + factor * smooth)
 
 
-def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats) -> Floats:
-    """Approximate factor of the scene's field on an environment's light `(H, W, 3)`."""
+def mean_factor(scene: HairScene, camera: Camera, envmap: AnyFloats, pixels: Ints) -> Floats:
+    """Approximate factor of the scene's field on an environment's light `(H, W, 3)`, at flat
+    `pixels (P,)`; 1 elsewhere."""
     out = np.ones((camera.height, camera.width, 3), np.float32)
-    index = covered_pixels(scene, camera)
-    field = field_of(scene, camera, index)
+    field = field_of(scene, camera, pixels)
     if field is not None and not field.additive:
         integrals = projected(envmap, 0.0, field.degree)
-        out.reshape(-1, 3)[index] = field.mean_factor(integrals)
+        out.reshape(-1, 3)[pixels] = field.mean_factor(integrals)
     return out
 
 

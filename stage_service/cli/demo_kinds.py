@@ -54,7 +54,7 @@ QUICK = DemoKind(
             "refine": {"steps": 0, "marginal_coverage": 0},
         },
         "fit": {"hair_pixels": 300, "roughness_spp": 6, "colour_spp": 8, "iterations": 2},
-        "assess": {"cameras": 1, "lights": 2, "spp": 8, "relit_size": 256, "relit_spp": 8},
+        "assess": {"cameras": 1, "lights": 2, "spp": 8, "relit_size": 256},
         "baselines": False,
     },
     27.0,

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from appearance import HairAppearance, Sampling, build_scene, render_environment
-from appearance.render.coverage import covered_pixels
+from appearance.render import environment
+from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.environment import _along_curve, direct_environment
 from appearance.render.environment_maps import load_environment, sky, studio
 from appearance.render.paths import Surface, camera_rays
+from appearance.render.smoothed import environment_smoothed
 from reconstruction import Camera, Strands, write_exr
 from reconstruction.array_backend import for_kernels
 
@@ -65,6 +67,30 @@ def test_clear_hair_in_a_uniform_world_vanishes(small):
     world = np.ones((8, 16, 3))
     image = render_environment(scene, small.camera(), world, Sampling(256, 60), background=True)
     assert image.mean() == pytest.approx(1, abs=0.015)
+
+
+def test_a_white_sky_is_reflected_in_full_by_clear_hair_in_smoothed_pictures(small):
+    """White furnace: direct and indirect light add up to the share of a pixel that hair covers."""
+    clear = HairAppearance((0.0, 0.0, 0.0), 0.3, 0.3)
+    scene, camera = build_scene(small.tuft(60), None, hair=clear), small.camera(size=16)
+    image = environment_smoothed(scene, camera, np.ones((8, 16, 3)), Sampling(32, 60))
+    covered = coverage(scene, camera, 1024)["hair"]
+    assert image.sum((0, 1)) == pytest.approx(np.full(3, covered.sum()), rel=0.015)
+
+
+def test_a_chosen_direction_has_less_noise_than_a_drawn_one_and_the_same_mean(small, monkeypatch):
+    """Hair scatters few of a map's bright directions towards a camera."""
+    scene, camera = build_scene(small.tuft(60), None, hair=HAIR), small.camera(size=16)
+
+    def pictures():
+        return np.array([direct_environment(scene, camera, studio(), 256, seed) for seed in (1, 2)])
+
+    chosen = pictures()
+    monkeypatch.setattr(environment, "CANDIDATES", 1)
+    monkeypatch.setattr(environment._Gather.__init__, "__defaults__", (1,))
+    drawn = pictures()
+    assert chosen.mean() == pytest.approx(drawn.mean(), rel=0.08)
+    assert np.std(chosen[0] - chosen[1]) < 0.6 * np.std(drawn[0] - drawn[1])
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_a_map_shows_the_sum_of_its_lights(observed, small, kind):
                 area = (z[i] - z[i + 1]) * 2 * np.pi / 16 / 4
                 watts = envmap[row, column] * area * far**2
                 lights.append(Light(f"{len(lights)}", d * far, watts))
-    few, bare = Sampling(256, 3), replace(scene, field=None)
+    few, bare = Sampling(1024, 3), replace(scene, field=None)
     pixels = covered_pixels(scene, camera)
 
     def olat(scene):
@@ -119,6 +119,8 @@ def test_a_map_shows_the_sum_of_its_lights(observed, small, kind):
         "mixed": lambda scene: render_mixed(scene, camera, [], [Environment(envmap)], few),
         "smoothed": lambda scene: environment_smoothed(scene, camera, envmap, Sampling(32, 3)),
     }
+    # smoothed pictures scatter the mean over a fibre's width, which shifts the lights' balance
+    bounds = {"map": 0.01, "mixed": 0.01, "smoothed": 0.015}
     # with and without the field of the same paths: what the field does, almost without noise
     parts, plain = olat(scene).sum(0), olat(bare).sum(0)
     for parity in (0, 1):
@@ -129,7 +131,7 @@ def test_a_map_shows_the_sum_of_its_lights(observed, small, kind):
         for name, picture in pictures.items():
             shown, without = (picture(x).reshape(-1, 3)[pixels[some]].sum(0) for x in (scene, bare))
             off = (shown - without) / (unit if kind else without) - change
-            assert np.abs(off).max() < (0.01 * np.abs(change).max() if kind else 0.01), name
+            assert np.abs(off).max() < (0.01 * np.abs(change).max() if kind else bounds[name]), name
 
 
 def test_smoothed_single_lights_have_the_field_in_full_detail(observed, small):

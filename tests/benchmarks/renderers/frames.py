@@ -1,7 +1,8 @@
-"""The simulators' frames beside many paths: error against CPU time of the ways to render them.
+"""Frames beside many paths: error against CPU time of the ways to render them.
 
 Judged on pixels of hair under held-out lights, as the demo judges pictures; then extreme hair and
-lights (`extremes`), as the simulators render them. Leaves `frames.json` and `frames.png`.
+lights (`extremes`), as the simulators render them; then pictures under maps. Leaves `frames.json`
+and `frames.png`.
 """
 
 from __future__ import annotations
@@ -14,16 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from appearance import HairScene, Sampling, render_olat
+from appearance import HairScene, Sampling, render_environment, render_olat
 from appearance.metrics.scores import Exposure
-from appearance.render.coverage import covered_pixels
-from appearance.render.smoothed import olat_smoothed
+from appearance.model.relight import three_quarter_view
+from appearance.render.coverage import coverage, covered_pixels
+from appearance.render.environment_maps import PROCEDURAL
+from appearance.render.smoothed import environment_smoothed, olat_smoothed
 from benchmarks.command import SUBJECT, Benchmark, option
 from benchmarks.renderers.cost import hair_pixels
 from benchmarks.renderers.extremes import Extreme, extremes
 from benchmarks.results import Panel, draw_panels, save
 from benchmarks.subjects import simulated
-from reconstruction import Camera, Light, Progress, Rig
+from reconstruction import Camera, Light, Progress, Rig, Strands
 from reconstruction.arrays import Array, Floats, Ints
 
 PLAIN, SMOOTHED, CHOSEN = "render_olat", "olat_smoothed", "chosen"
@@ -45,9 +48,11 @@ class Effort:
     every_nth_light: int = 28
     cameras: int = 8
     timed: float = 0.2
+    maps: tuple[int, Sequence[int], int] = 64, (1, 3, 6, 12), 1024
+    """Side of a picture under a map, paths a pixel, and of what it is held against."""
 
 
-QUICK = Effort((2, 4), (2, 4), 4, 32, 30, 160, 1, 0.05)
+QUICK = Effort((2, 4), (2, 4), 4, 32, 30, 160, 1, 0.05, (12, (1,), 8))
 
 
 def methods(effort: Effort) -> dict[tuple[str, int], Callable[..., Floats]]:
@@ -158,8 +163,43 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     result["extremes"] = {
         e.name: _extreme(e, cameras[0], effort) for e in extremes(subject, lights)
     }
+    result["maps"] = {name: _mapped(scene, subject.strands, name, effort) for name in PROCEDURAL}
     save(args.out / "frames.json", result)
     return result
+
+
+def _mapped(scene: HairScene, strands: Strands, name: str, effort: Effort) -> dict[str, Any]:
+    """CPU seconds and error of `environment_smoothed` under a map by paths a pixel, on hair.
+
+    `bias_db` is of the product of the errors of seeds 1 and 2 against independent halves.
+    """
+    size, paths, many = effort.maps
+    camera, envmap = three_quarter_view(strands, size), PROCEDURAL[name]()
+    hair = coverage(scene, camera)["hair"] > 0.5
+    halves = [
+        render_environment(scene, camera, envmap, Sampling(many // 2, DEPTH, 1000 + k))[hair]
+        for k in (0, 1)
+    ]
+    exposure, found = Exposure.of(halves), dict[str, Any]()
+    truth = [exposure(x) for x in halves]
+    noise = float(((truth[0] - truth[1]) ** 2).mean()) / 4
+    for spp in paths:
+        images, cpu_s = [], 0.0
+        for seed in (0, 1, 2):  # the first compiles
+            start = time.process_time()
+            image = environment_smoothed(scene, camera, envmap, Sampling(spp, DEPTH, seed))
+            cpu_s = time.process_time() - start
+            images.append(image[hair])
+        off = [[exposure(x) - t for t in truth] for x in images[1:]]
+        each = [((one + other) ** 2).mean() / 4 - noise for one, other in off]
+        error, shared = float(np.mean(each)), float((off[0][0] * off[1][1]).mean())
+        found[str(spp)] = {
+            "cpu_seconds": cpu_s,
+            "psnr_db": -10 * float(np.log10(max(error, 1e-10))),
+            "bias_db": -10 * float(np.log10(max(shared, 1e-10))),
+            "mean": float(np.mean(images[1:]) / np.mean(halves)),
+        }
+    return found
 
 
 def _extreme(extreme: Extreme, camera: Camera, effort: Effort) -> dict[str, float]:
