@@ -285,7 +285,8 @@ class Sky:
 
         width, draws = dr.width(active), opaque_index(count)
         start = (dr.zeros(mi.UInt32, width), mi.Vector3f(0, 0, 1), mi.Color3f(0), mi.Float(0), rng)
-        _, kept, colour, total, after = dr.while_loop(start, more, body, label="candidates")
+        end: Any = dr.while_loop(start, more, body, label="candidates")
+        _, kept, colour, total, after = end
         rng.state = after.state
         return kept, colour * (total / mi.Float(draws))
 
