@@ -51,7 +51,7 @@ class World:
 
     The subject is at pose 0 until the sweep. A tracking exposure (all projectors on) after rows
     begins the next pose; a repeated one keeps it. Pose 0 returns when a new capture begins: at the
-    first pulse after a reset if it is dark, or when a single lamp is lit.
+    first pulse after a reset if it is dark, or when a single lamp or a pattern of lamps is lit.
 
     `make` renders and exposes on one thread per lane; camera number i belongs to lane i modulo
     `lanes`. `log` gets one JSON line per pulse with its pose. `busy(camera)` has the further fields
@@ -179,7 +179,7 @@ class World:
 
     def _move_subject(self, power: Array, show: Show) -> None:
         lit = int(np.count_nonzero(power))
-        anew = lit == 1 or (self._pulses == 1 and lit == 0 and show.level == 0)
+        anew = lit == 1 or np.ptp(power) > 0 or (self._pulses == 1 and lit == 0 and show.level == 0)
         if anew:
             self._pose, self._rows_shown = 0, False
         elif show.everything:

@@ -30,9 +30,8 @@ Exposure = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 Text = StringConstraints(strip_whitespace=True)
 """Text without blanks at its ends."""
-Names = Annotated[
-    tuple[Annotated[str, Field(max_length=LONGEST_NAME)], ...], Field(max_length=4096)
-]
+Name = Annotated[str, Field(max_length=LONGEST_NAME)]
+Names = Annotated[tuple[Name, ...], Field(max_length=4096)]
 
 
 class Exposures(Strict):
@@ -41,18 +40,21 @@ class Exposures(Strict):
     dark: Exposure = 0.02
     all_on: Exposure = 0.02
     olat: Exposure = 0.02
+    pattern: Exposure = 0.02
     scanline: Exposure = 0.02
     tracking: Exposure = 0.02
 
 
 class Levels(Strict):
-    """Lamp (`olat`, `all_on`) and projector (`scanline`, `tracking`) levels, 0 to 1.
+    """Lamp (`olat`, `all_on`, `pattern`) and projector (`scanline`, `tracking`) levels, 0 to 1.
 
-    All lamps at once are some hundred times one lamp: `all_on` must be low, or it saturates.
+    All lamps at once are some hundred times one lamp: `all_on` must be low, or it saturates; so
+    must `pattern`, of half of the lamps, whose weights it scales.
     """
 
     all_on: Level = 0.02
     olat: Level = 1.0
+    pattern: Level = 0.04
     scanline: Level = 1.0
     tracking: Level = 0.5
 

@@ -270,14 +270,15 @@ class Health(BaseModel):
 
 
 class StepView(BaseModel):
-    """A commanded exposure; `light` for "olat", `projector` and `row` for "scanline". `lacks`: the
-    cameras without a frame of it."""
+    """A commanded exposure; `light` for "olat", `pattern` for "pattern", `projector` and `row` for
+    "scanline". `lacks`: the cameras without a frame of it."""
 
     index: int
     kind: StepKind
     exposure: float
     level: float
     light: str | None = None
+    pattern: str | None = None
     projector: str | None = None
     row: int | None = None
     lacks: list[str] = []

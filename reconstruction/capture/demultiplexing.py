@@ -42,7 +42,8 @@ def demultiplex(source: Capture, out: Path, progress: Progress = silent) -> Demu
 
     With more patterns than lights, each frame weighs by its noise, estimated from residuals. Pixels
     that are saturated under a pattern are in every light that it contributes to; other frames are
-    copied. Raises `CaptureError` without patterns, or where they do not determine the lights.
+    copied. Raises `CaptureError` without patterns, where they do not determine the lights, or where
+    all pixels of a camera are saturated.
     """
     patterns = source.patterns
     if patterns is None:
@@ -102,6 +103,11 @@ def _weighted(
         values.append(image.reshape(-1, 3)[::step].astype(float))
         usable = ~saturated.ravel()[::step]
         known = usable if known is None else known & usable
+    if known is None or not known.any():
+        raise CaptureError(
+            f"{source.path}: every pixel of {camera} is saturated under a pattern: shoot them at a "
+            "lower level or a shorter exposure"
+        )
     frames, misfit = np.stack(values)[:, known], 0.0
     size = float(np.square(frames).mean()) or 1.0
     for turn in range(_TURNS):

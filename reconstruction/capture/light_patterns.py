@@ -23,6 +23,8 @@ from reconstruction.geometry.lights import LightPattern
 from reconstruction.geometry.rig import Rig, counted
 from reconstruction.reading import read_json, read_text
 
+Table = Mapping[str, Mapping[str, float]]
+"""By pattern, weights by light."""
 TABLES = ("patterns.csv", "patterns.json")
 ILL_CONDITIONED = 1e3
 """Condition number from which on errors of weights of 0.1 % are as large as single lights."""
@@ -81,6 +83,16 @@ class LightPatterns:
         """As `of_plan` reads it."""
         rows = zip(self.names, self.weights.tolist(), strict=True)
         return {"lights": list(self.lights), "weights": dict(rows)}
+
+    @classmethod
+    def of_table(cls, table: Table, lights: Sequence[str]) -> LightPatterns:
+        """The patterns of a `Table` for a rig's `lights`; see `read_patterns`."""
+        rows = {name: _matching(row, lights) for name, row in table.items()}
+        if named := sorted(set(rows) & set(lights)):
+            raise PatternError(f"a pattern needs a file's name that no light has, got {named[0]!r}")
+        used = list(dict.fromkeys(x for row in rows.values() for x, w in row.items() if w != 0))
+        weights = [[row.get(x, 0.0) for x in used] for row in rows.values()]
+        return cls(tuple(rows), tuple(used), np.array(weights, float).reshape(len(rows), len(used)))
 
     @classmethod
     def of_plan(cls, plan: Mapping[str, Any], rig: Rig, used: Collection[str]) -> LightPatterns:
@@ -148,7 +160,7 @@ class Demultiplexing:
             if gain.max() > 1:
                 out.append(
                     f"{kind} of {int((gain > 1).sum())} of {len(gain)} lights is amplified, up to "
-                    f"{gain.max():.2g} times, against single frames of the same exposure"
+                    f"{gain.max():.2g} times, against single frames of the same exposure and level"
                 )
         return out
 
@@ -158,21 +170,26 @@ def read_patterns(path: Path, lights: Sequence[str]) -> LightPatterns:
 
     A light is named as in the rig or by its number at the end. Raises `PatternError`.
     """
+    table = read_table(path)
+    try:
+        return LightPatterns.of_table(table, lights)
+    except ValueError as error:
+        raise PatternError(f"{path}: {error}") from error
+
+
+def read_table(path: Path) -> Table:
+    """The weights by light of each pattern, by the names in the file. Raises `PatternError`."""
     readers = {".csv": _csv, ".json": _json}
     if path.suffix.lower() not in readers:
         raise PatternError(f"{path}: expected a table of patterns ({', '.join(readers)})")
     try:
-        rows = {n: _matching(w, lights) for n, w in readers[path.suffix.lower()](path).items()}
-        used = list(dict.fromkeys(x for row in rows.values() for x, w in row.items() if w != 0))
-        weights = [[row.get(x, 0.0) for x in used] for row in rows.values()]
-        table = np.array(weights, float).reshape(len(rows), len(used))
-        return LightPatterns(tuple(rows), tuple(used), table)
+        return readers[path.suffix.lower()](path)
     except (OSError, ValueError, TypeError) as error:
         text = str(error).removeprefix(f"{path}: ")
         raise PatternError(f"{path}: {text}") from error
 
 
-def _csv(path: Path) -> dict[str, dict[str, float]]:
+def _csv(path: Path) -> Table:
     lines = [row for row in csv.reader(read_text(path).splitlines()) if any(row)]
     if len(lines) < 2 or len(lines[0]) < 2:
         raise PatternError("expected a header with the lights and a row for each pattern")
@@ -190,7 +207,7 @@ def _csv(path: Path) -> dict[str, dict[str, float]]:
     return out
 
 
-def _json(path: Path) -> dict[str, dict[str, float]]:
+def _json(path: Path) -> Table:
     data = read_json(path)
     data = data.get("patterns", data) if isinstance(data, dict) else data
     if not isinstance(data, dict):

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from reconstruction import Step
 from stage_service.acquisition.timings import Timings
 from stage_service.devices.cameras.fan_out import FanOut
@@ -14,6 +16,7 @@ from stage_service.devices.device_set import DeviceSet
 from stage_service.devices.errors import Cancelled, DeviceError, SafetyRefusal
 from stage_service.devices.lights.interface import CONTRADICTED, lamps_lit, mismatch_todo
 from stage_service.plan.flash import FASTEST_HZ, SLOW_HZ, SLOWEST_HZ, Trains
+from stage_service.plan.patterns import LAMP_KINDS, LampLevels
 
 
 @dataclass(frozen=True)
@@ -36,15 +39,14 @@ class Exposing:
     def __init__(
         self,
         devices: DeviceSet,
-        lamp: dict[str, int],
+        lamp_levels: LampLevels,
         cancel: threading.Event,
         timings: Timings,
-        *,
         rate_hz: float | None,
         watch: Callable[[Step], None] | None,
     ) -> None:
-        self._watch = watch
-        self._devices, self._lamp, self._cancel, self._timings = devices, lamp, cancel, timings
+        self._watch, self._lamp_levels = watch, lamp_levels
+        self._devices, self._cancel, self._timings = devices, cancel, timings
         self._period = 1 / rate_hz if rate_hz else 0.0
         self._next = 0.0
 
@@ -81,7 +83,7 @@ class Exposing:
 
     def dark(self, step: Step | None = None) -> None:
         """Put off what the step lit; without a step, everything."""
-        if step is None or step.kind in ("olat", "all_on"):
+        if step is None or step.kind in LAMP_KINDS:
             self._devices.lights.off()
         projected = step is None or step.kind in ("scanline", "tracking")
         if projected and self._devices.projectors is not None:
@@ -92,9 +94,11 @@ class Exposing:
         if step.kind in ("olat", "all_on"):
             lights.set_level(step.level)
         if step.light is not None:
-            lights.select(self._lamp[step.light])
+            lights.select(int(self._lamp_levels(step).argmax()))
         elif step.kind == "all_on":
             lights.all_on()
+        elif step.kind == "pattern":
+            lights.show(self._lamp_levels(step).tolist())
         elif step.kind == "dark":
             self.dark()
         else:
@@ -114,11 +118,11 @@ class Exposing:
     def _check_lamps(self, step: Step) -> None:
         """Raise where lamps went off during the exposure: the frame would look like a dark one."""
         lights = self._devices.lights
-        if step.kind not in ("olat", "all_on") or not lights.capabilities.reads_back:
+        if step.kind not in LAMP_KINDS or not lights.capabilities.reads_back:
             return
-        status, expected = lights.status(), 1 if step.kind == "olat" else lights.count
+        status, expected = lights.status(), int(np.count_nonzero(self._lamp_levels(step)))
         if status.lit != expected:
-            doing = f"counting lit lamps after step {step.index} ({step.light or step.kind})"
+            doing = f"counting lit lamps after step {step.index} ({step.lighting or step.kind})"
             received, todo = f"{status.lit} lit{status.causes}", mismatch_todo(expected, status)
             lights.contradicted |= CONTRADICTED in todo
             raise DeviceError(lights.name, doing, lamps_lit(expected), received, todo)

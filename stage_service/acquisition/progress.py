@@ -169,7 +169,7 @@ class RunProgress:
             left = self._left(live)
             return Progress(
                 step=self._done + live,
-                **{k: about.get(k) for k in ("kind", "light", "projector", "row")},
+                **{k: about.get(k) for k in ("kind", "light", "pattern", "projector", "row")},
                 by_box=bool(self._run),
                 frames={name: n + self._came[name] for name, n in self._frames.items()},
                 here=0 if self._waited_for is None else len(self._frames) - len(self._waited_for),

@@ -82,7 +82,7 @@ class Sequencer:
         self._unclear: dict[str, str] = {}
         self._timings = Timings()
         self._exposing = Exposing(
-            devices, self._lamp, self._cancel, self._timings, rate_hz=self._rate_hz, watch=watch
+            devices, plan.lamp_levels, self._cancel, self._timings, self._rate_hz, watch
         )
         self._intake = FrameIntake(devices, self.progress, self._timings, self._cancel)
         self.by_device = self._intake.by_device

@@ -104,7 +104,8 @@ class Waiting(BaseModel):
 
 
 class Progress(BaseModel):
-    """Progress of a run: the step's light, or projector and row; `by_box`: the trigger box clocks.
+    """Progress of a run: the step's light, pattern, or projector and row; `by_box`: the trigger box
+    clocks.
 
     `step` counts steps of which all frames have arrived, `frames` each camera's frames, `here`
     cameras that have replied for the current step, `again` frames that are shot again. `waiting`
@@ -118,6 +119,7 @@ class Progress(BaseModel):
     step: int
     kind: str | None = None
     light: str | None = None
+    pattern: str | None = None
     projector: str | None = None
     row: int | None = None
     by_box: bool = False

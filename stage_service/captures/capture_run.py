@@ -144,7 +144,8 @@ def plan_of(capture: Capture, rig_file: RigFile) -> ResolvedPlan:
         problem = f"{capture.path}: its plan is not of this version: {sentence(error)}"
         raise PlanError([problem]) from error
     resolved = resolve(plan, rig_file)
-    if resolved.steps != capture.steps:
-        changed = "[capture] has changed since this capture, and with it the plan's steps"
+    recorded = {k: v for k, v in capture.plan.items() if k == "patterns"}
+    if resolved.steps != capture.steps or resolved.recorded_patterns != recorded:
+        changed = "[capture] or [devices] has changed since this capture, and with it the steps"
         raise PlanError([f"{rig_file.path}: {changed}: start a new one"])
     return resolved

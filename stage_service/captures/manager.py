@@ -104,6 +104,7 @@ class CaptureManager(LightControl):
             "plan": plan.model_dump(mode="json"),
             "cost": cost.model_dump(mode="json"),
             "started": utc_now(),
+            **resolved.recorded_patterns,
             "armed_by": word.armed_by,
             "request": extra or {},
         }

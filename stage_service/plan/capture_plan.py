@@ -6,12 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from stage_service.config import Exposure, Level, Names, Text
+from stage_service.config import Exposure, Level, Name, Names, Text
 from stage_service.device_config import Strict
 from stage_service.plan.person_text import LINES
 
 MOST_ROWS = 100_000
 Bracket = Annotated[float, Field(gt=0.0, le=1000.0)]
+
+
+Weight = Annotated[float, Field(ge=0.0, le=1.0)]
+Row = Annotated[dict[Name, Weight] | tuple[Name, ...], Field(min_length=1, max_length=4096)]
+PatternTable = Annotated[dict[Name, Row], Field(min_length=1, max_length=4096)]
+"""By pattern, weights by light, or the lights that are fully on; other lights are off."""
 
 
 class KindExposures(Strict):
@@ -20,6 +26,7 @@ class KindExposures(Strict):
     dark: Exposure | None = None
     all_on: Exposure | None = None
     olat: Exposure | None = None
+    pattern: Exposure | None = None
     scanline: Exposure | None = None
     tracking: Exposure | None = None
 
@@ -29,6 +36,7 @@ class KindLevels(Strict):
 
     all_on: Level | None = None
     olat: Level | None = None
+    pattern: Level | None = None
     scanline: Level | None = None
     tracking: Level | None = None
 
@@ -44,7 +52,9 @@ class Rows(Strict):
 class CapturePlan(Strict):
     """What to shoot. The order is: dark, all on; each light alone; the sweep; dark, all on.
 
-    `brackets` are factors on the exposure of a light alone: all lights at the first factor, then
+    `patterns` replace single lights: a table of weights, or one made for `lights`: "s_matrix", as
+    many patterns of half of them as determine them, or "gradients", full and along each axis.
+    `brackets` are factors on the exposure of a light or pattern: all at the first factor, then
     all at the next, so that cameras are armed once for each. `rate_hz` limits the steps per second.
     `stepping`: the service or the trigger box clocks the steps; "auto" prefers the box. `consent`
     records who agreed, when, and to what, if a living subject sees flashes of 3 to 30 Hz.
@@ -57,6 +67,7 @@ class CapturePlan(Strict):
     """
 
     lights: Literal["all"] | Names = "all"
+    patterns: Literal["s_matrix", "gradients"] | PatternTable | None = None
     projectors: Literal["all"] | Names = "all"
     rows: Rows = Rows()
     sentinels: bool = True

@@ -9,6 +9,7 @@ import numpy as np
 from reconstruction import Rig, Step
 from stage_service.device_config import Strict
 from stage_service.plan.flash import FlashRate
+from stage_service.plan.patterns import LAMP_KINDS, LampLevels
 
 EXR_HEADER_BYTES = 700
 """Bytes of an EXR file beside 12 bytes per pixel and its table of lines."""
@@ -54,26 +55,24 @@ def folder_bytes(rig: Rig) -> int:
 
 
 def dose_of(
-    rig: Rig, steps: Sequence[Step], overhead_s: float
+    rig: Rig, steps: Sequence[Step], overhead_s: float, lamp_levels: LampLevels
 ) -> tuple[float, tuple[float, float, float]]:
     """Lamp seconds, and radiant exposure at the head's centre, J/m² per channel.
 
     By the inverse-square law; a light is on `overhead_s` longer than its exposure. A row counts as
     1/height of its projector.
     """
-    lamps = {x.name: x.irradiance(np.zeros(3)) for x in rig.lights}
+    lamps = np.reshape([x.irradiance(np.zeros(3)) for x in rig.lights], (-1, 3))
     beams = {p.name: (p.intensity / (p.center @ p.center), p.height) for p in rig.projectors}
-    all_lamps = sum(lamps.values(), np.zeros(3))
     all_beams = sum((beam for beam, _ in beams.values()), np.zeros(3))
     dose, lamp_seconds = np.zeros(3), 0.0
     for step in steps:
-        time = step.level * (step.exposure + overhead_s)
-        if step.kind == "all_on":
-            dose += time * all_lamps
-            lamp_seconds += time * len(lamps)
-        elif step.light is not None:
-            dose += time * lamps[step.light]
-            lamp_seconds += time
+        seconds = step.exposure + overhead_s
+        time = step.level * seconds
+        if step.kind in LAMP_KINDS:
+            levels = lamp_levels(step)
+            dose += seconds * (levels @ lamps)
+            lamp_seconds += seconds * float(levels.sum())
         elif step.kind == "tracking":
             dose += time * all_beams
         elif step.projector is not None:

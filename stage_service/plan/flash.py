@@ -6,6 +6,7 @@ epilepsy"); up to three flashes in a second pass (W3C, WCAG 2.2, success criteri
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from typing import Literal
@@ -59,9 +60,14 @@ class FlashRefusal(RuntimeError):
 
 
 class _Train:
-    """Consecutive flashes of one kind, with the newest intervals that are in the band."""
+    """Consecutive flashes of one kind, with the newest intervals that are in the band.
 
-    def __init__(self) -> None:
+    `uneven`: they differ in brightness, so that every n-th may stand out. Above the band they count
+    as the fastest rate / n within it.
+    """
+
+    def __init__(self, uneven: bool = False) -> None:
+        self._uneven = uneven
         self._last: float | None = None
         self._begins: deque[float] = deque(maxlen=IN_A_ROW)
         self._newest: deque[float] = deque(maxlen=IN_A_ROW + 1)
@@ -73,12 +79,13 @@ class _Train:
         if before is None:
             return None
         low, high = 1 / FASTEST_HZ - ROUNDING, 1 / SLOWEST_HZ + ROUNDING
-        if not low <= at - before <= high:
+        if at - before > high or (at - before < low and not self._uneven):
             return None
         self._begins.append(before)
         if len(self._begins) < IN_A_ROW or at - self._begins[0] > 1 + ROUNDING:
             return None
-        return IN_A_ROW / (at - self._begins[0])
+        rate = IN_A_ROW / max(at - self._begins[0], ROUNDING)
+        return rate / max(1, math.ceil(rate / FASTEST_HZ - ROUNDING))
 
     def rate(self) -> float:
         """Hz over the newest flashes; 0 if they are too few."""
@@ -89,17 +96,21 @@ class _Train:
 
 class Trains:
     """All lights as one train, and the full-field flashes among them as another: tracking frames
-    are much brighter than scanlines and have a rate of their own."""
+    are much brighter than scanlines and have a rate of their own. So have patterns of lights, whose
+    brightness varies."""
 
     def __init__(self) -> None:
         self.each = _Train()
         self._full_field = _Train()
+        self._patterns = _Train(uneven=True)
 
     def add(self, step: Step, at: float) -> float | None:
         """The rate in the band after this flash, or None."""
         rates = [self.each.add(at)]
         if step.kind in ("tracking", "all_on"):
             rates.append(self._full_field.add(at))
+        if step.kind == "pattern":
+            rates.append(self._patterns.add(at))
         found = [r for r in rates if r is not None]
         return max(found) if found else None
 

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from reconstruction import Rig
+import numpy as np
+
+from reconstruction import Rig, Step
+from reconstruction.arrays import Ints
 from stage_service.config import PROJECTOR_LEVELS, SafetyLimits
 from stage_service.device_config import LightBankConfig
+from stage_service.plan.patterns import LAMP_KINDS, LampLevels
 from stage_service.plan.stepping import Run
 from stage_service.plan.timeline import Lit
 
 PROJECTORS = PROJECTOR_LEVELS, "projector controller"
+Light = tuple[str, str | None, float]
 
 
-def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[str]:
+def check_limits(
+    lights: Iterable[Lit], rig: Rig, limits: SafetyLimits, lamp_levels: LampLevels
+) -> list[str]:
     """One sentence for each limit that the plan exceeds, its worst case; without retries."""
-    steps = [x for x in lights if x.step.kind in ("olat", "all_on")]
+    steps = [x for x in lights if x.step.kind in LAMP_KINDS]
     if not steps:
         return []
     problems = []
@@ -27,24 +34,41 @@ def check_limits(lights: Iterable[Lit], rig: Rig, limits: SafetyLimits) -> list[
             f"{longest.seconds:.3g} s; [safety] max_on_s allows {limits.max_on_s:g} s: shorten the "
             "exposure or its brackets"
         )
-    lamps = {x.step.kind: len(rig.lights) if x.step.kind == "all_on" else 1 for x in steps}
-    for kind, count in lamps.items():
+    levels = {_light_of(x.step): lamp_levels(x.step) for x in steps}
+    most_lit, most_drawn = dict[str, int](), dict[str, tuple[float, Step]]()
+    for step in (x.step for x in steps):
+        lit, drawn = np.count_nonzero(levels[_light_of(step)]), levels[_light_of(step)].sum()
+        most_lit[step.kind] = max(most_lit.get(step.kind, 0), int(lit))
+        if step.kind not in most_drawn or drawn > most_drawn[step.kind][0]:
+            most_drawn[step.kind] = float(drawn), step
+    for kind, count in most_lit.items():
         if limits.max_lamps is not None and count > limits.max_lamps:
+            fewer = "light fewer in a pattern"
+            if kind != "pattern":
+                fewer = "leave the sentinels out (sentinels = false)"
             problems.append(
                 f"{kind}: {count} lamps would be lit at once; [safety] max_lamps allows "
-                f"{limits.max_lamps}: leave the sentinels out (sentinels = false)"
+                f"{limits.max_lamps}: {fewer}"
             )
-        level = max(x.step.level for x in steps if x.step.kind == kind)
-        power = count * level * limits.lamp_power_w
+        drawn, step = most_drawn[kind]
+        power = drawn * limits.lamp_power_w
         if limits.max_power_w is not None and power > limits.max_power_w:
-            most = limits.max_power_w / (count * limits.lamp_power_w)
+            lit = np.count_nonzero(levels[_light_of(step)])
+            lamps = f"{lit} lamps" if step.pattern is None else f"{lit} lamps of {step.pattern}"
             problems.append(
-                f"level.{kind}: {count} lamps at level {level:g} draw {power:.4g} W; [safety] "
-                f"max_power_w allows {limits.max_power_w:g} W: at most level {most:.3g}"
+                f"level.{kind}: {lamps} at level {step.level:g} draw {power:.4g} W; [safety] "
+                f"max_power_w allows {limits.max_power_w:g} W: at most level "
+                f"{step.level * limits.max_power_w / power:.3g}"
             )
     if limits.max_duty < 1:
-        problems += _check_duty(steps, rig, limits)
+        lit_lamps = {light: np.flatnonzero(own) for light, own in levels.items()}
+        problems += _check_duty(steps, rig, limits, lit_lamps)
     return problems
+
+
+def _light_of(step: Step) -> Light:
+    """What decides the levels of the lamps."""
+    return step.kind, step.lighting, step.level
 
 
 def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
@@ -55,7 +79,7 @@ def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
         for step in part.steps:
             if step.kind == "dark":
                 continue
-            of_lamps = step.kind in ("olat", "all_on")
+            of_lamps = step.kind in LAMP_KINDS
             steps, who = (lamps, "light bank of [devices.lights]") if of_lamps else PROJECTORS
             what = f"level.{step.kind}: the {who}"
             if steps == 1 and step.level != 1:
@@ -70,13 +94,14 @@ def check_levels(parts: Iterable[Run], bank: LightBankConfig) -> list[str]:
     return list(problems.values())
 
 
-def _check_duty(steps: Sequence[Lit], rig: Rig, limits: SafetyLimits) -> list[str]:
+def _check_duty(
+    steps: Sequence[Lit], rig: Rig, limits: SafetyLimits, lit_lamps: Mapping[Light, Ints]
+) -> list[str]:
     window, most = limits.duty_window_s, limits.max_duty
     spans: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for lit in steps:
-        names = [x.name for x in rig.lights] if lit.step.light is None else [lit.step.light]
-        for name in names:
-            spans[name].append((lit.at, lit.at + lit.seconds))
+        for lamp in lit_lamps[_light_of(lit.step)]:
+            spans[rig.lights[lamp].name].append((lit.at, lit.at + lit.seconds))
     worst, name = max((longest_on(own, window), name) for name, own in spans.items())
     if worst <= most * window:
         return []

@@ -7,17 +7,26 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from reconstruction import Step
+from reconstruction.capture.light_patterns import LightPatterns, PatternError
 from reconstruction.files.durable import RESERVE
 from stage_service.config import LONGEST_S, SHORTEST_S, RigFile
 from stage_service.plan.capture_plan import CapturePlan
 from stage_service.plan.cost import LeftOutWork, PlanCost, dose_of, folder_bytes
 from stage_service.plan.flash import SLOW_HZ, FlashRefusal, flash_rate
 from stage_service.plan.limits import check_levels, check_limits
-from stage_service.plan.stepping import LATENCY_S, Run, limited_by, runs, seconds_by_cause
-from stage_service.plan.steps import expand, exposures_of, no_controller, rows_of, swept
+from stage_service.plan.patterns import LampLevels, patterns_of
+from stage_service.plan.stepping import (
+    LATENCY_S,
+    NO_PATTERNS,
+    Run,
+    limited_by,
+    runs,
+    seconds_by_cause,
+)
+from stage_service.plan.steps import expand, exposures_of, levels_of, no_controller, rows_of, swept
 from stage_service.plan.timeline import timeline
 
 MOST_LISTED = 20
@@ -36,7 +45,7 @@ class PlanError(ValueError):
 class ResolvedPlan:
     """A plan that `rig_file` can shoot: its steps in order, divided into runs.
 
-    `stepping_why` is the reason for how they are clocked.
+    `stepping_why` is the reason for how they are clocked; `patterns` are those that are lit.
     """
 
     plan: CapturePlan
@@ -44,6 +53,17 @@ class ResolvedPlan:
     steps: tuple[Step, ...]
     runs: tuple[Run, ...]
     stepping_why: str
+    patterns: LightPatterns | None = None
+
+    @cached_property
+    def lamp_levels(self) -> LampLevels:
+        """The level of each lamp in a step."""
+        return LampLevels(self.rig_file.rig, self.patterns)
+
+    @property
+    def recorded_patterns(self) -> dict[str, Any]:
+        """The field `patterns` of the capture's `plan.json`; empty without any."""
+        return {} if self.patterns is None else {"patterns": self.patterns.to_dict()}
 
     @property
     def retries(self) -> int:
@@ -90,7 +110,7 @@ class ResolvedPlan:
         devices = self.rig_file.devices
         overhead = causes["settle"] / len(steps) + LATENCY_S
         overhead += 0.0 if devices is None else devices.cameras.lag_s
-        lamp_seconds, dose = dose_of(rig, steps, overhead)
+        lamp_seconds, dose = dose_of(rig, steps, overhead, self.lamp_levels)
         clocked = Counter({"software": 0, "hardware": 0})
         for run in self.runs:
             clocked[run.stepping] += len(run.steps)
@@ -129,19 +149,26 @@ class ResolvedPlan:
 def resolve(plan: CapturePlan, rig_file: RigFile) -> ResolvedPlan:
     """Apply a plan to a rig; uses no device. Raises `PlanError` with every problem."""
     problems = _misfits(plan, rig_file)
-    steps = () if problems else expand(plan, rig_file)
+    patterns = None
+    try:
+        if not problems:
+            patterns = patterns_of(plan, rig_file, levels_of(plan, rig_file).pattern)
+    except PatternError as error:
+        problems.append(f"patterns: {error}")
+    steps = () if problems else expand(plan, rig_file, patterns)
     if not problems and not steps:
         problems.append("the plan has no steps: no lights, no projectors, no sentinels")
     if problems:
         raise PlanError(problems)
     parts, why = runs(steps, rig_file, plan.stepping)
     lights = timeline(parts, rig_file, rate_hz=plan.rate_hz)
-    problems += check_limits(lights, rig_file.rig, rig_file.safety)
+    lamp_levels = LampLevels(rig_file.rig, patterns)
+    problems += check_limits(lights, rig_file.rig, rig_file.safety, lamp_levels)
     if rig_file.devices is not None:
         problems += check_levels(parts, rig_file.devices.lights)
     if problems:
         raise PlanError(problems)
-    return ResolvedPlan(plan, rig_file, steps, parts, why)
+    return ResolvedPlan(plan, rig_file, steps, parts, why, patterns)
 
 
 def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
@@ -157,11 +184,12 @@ def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
             )
     if len(set(plan.brackets)) < len(plan.brackets):
         problems.append(f"brackets: {list(plan.brackets)} has a factor twice")
-    olat = exposures_of(plan, rig_file).olat
+    exposures = exposures_of(plan, rig_file)
+    base = exposures.olat if plan.patterns is None else exposures.pattern
     for factor in plan.brackets:
-        if not SHORTEST_S <= factor * olat <= LONGEST_S:
+        if not SHORTEST_S <= factor * base <= LONGEST_S:
             problems.append(
-                f"brackets: {factor:g} times {olat:g} s is an exposure of {factor * olat:g} s; "
+                f"brackets: {factor:g} times {base:g} s is an exposure of {factor * base:g} s; "
                 f"the trigger box makes {SHORTEST_S:g} to {LONGEST_S:g} s"
             )
     if plan.stepping == "hardware" and (devices is None or not devices.hardware_stepping):
@@ -169,6 +197,8 @@ def _misfits(plan: CapturePlan, rig_file: RigFile) -> list[str]:
             "stepping: the rig file does not say that the trigger box's gates are wired; set "
             "hardware_stepping in [devices], or let the service step"
         )
+    if plan.stepping == "hardware" and plan.patterns is not None:
+        problems.append(f"stepping: {NO_PATTERNS}, no pattern: let the service step")
     if plan.projectors != "all" and plan.projectors and no_controller(rig_file):
         problems.append("projectors: the rig file has no [devices.projectors]")
     return problems

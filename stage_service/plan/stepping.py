@@ -10,6 +10,7 @@ from typing import Literal
 from reconstruction import Step
 from stage_service.config import RigFile
 from stage_service.device_config import DevicesConfig
+from stage_service.plan.patterns import LAMP_KINDS
 
 Stepping = Literal["software", "hardware"]
 
@@ -17,6 +18,7 @@ LATENCY_S = 0.002
 """Command, confirmation and pulse of a software-stepped step."""
 UPLOAD_S = 0.05
 """Arming, uploading and starting a hardware-stepped run."""
+NO_PATTERNS = "an entry of the light bank's sequence table lights one lamp or all"
 SHORTEST_RUN = 8
 """Steps below which uploading a table takes longer than it saves."""
 
@@ -53,7 +55,8 @@ def runs(
     gated = devices.lights.sequences
 
     def alike(step: Step) -> tuple[float, bool]:
-        return step.exposure, gated or step.kind not in ("olat", "all_on")
+        by_table = gated and step.kind != "pattern"
+        return step.exposure, by_table or step.kind not in LAMP_KINDS
 
     for (_, by_box), group in groupby(steps, key=alike):
         own = tuple(group)
@@ -66,6 +69,8 @@ def runs(
             out.append(Run(part, stepping))
     clocked = sum(len(r.steps) for r in out if r.stepping == "hardware")
     lamps = "" if gated else "; the light bank has no sequence table, so the service lights lamps"
+    if gated and any(s.kind == "pattern" for s in steps):
+        lamps = f"; {NO_PATTERNS}, so the service lights patterns"
     if clocked == 0:
         return tuple(out), f"no {SHORTEST_RUN} steps in a row share an exposure time{lamps}"
     return tuple(out), f"the trigger box clocks {clocked} of {len(steps)} steps{lamps}"

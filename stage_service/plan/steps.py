@@ -5,22 +5,31 @@ from __future__ import annotations
 from typing import Any
 
 from reconstruction import Projector, Step
+from reconstruction.capture.light_patterns import LightPatterns
 from stage_service.config import Exposures, Levels, RigFile
 from stage_service.plan.capture_plan import CapturePlan, Rows
+from stage_service.plan.patterns import level_of_bank
 
 
-def expand(plan: CapturePlan, rig_file: RigFile) -> tuple[Step, ...]:
-    """The steps of a plan that names only what the rig has."""
+def expand(
+    plan: CapturePlan, rig_file: RigFile, patterns: LightPatterns | None = None
+) -> tuple[Step, ...]:
+    """The steps of a plan that names only what the rig has; `patterns` are the plan's."""
     defaults = rig_file.capture
     exposures, levels = exposures_of(plan, rig_file), levels_of(plan, rig_file)
+    levels = levels.model_copy(update={"pattern": level_of_bank(levels.pattern, rig_file)})
     ends = [{"kind": "dark"}, {"kind": "all_on"}] if plan.sentinels else []
+    kind, field = "olat", "light"
     names = [x.name for x in rig_file.rig.lights] if plan.lights == "all" else plan.lights
+    if patterns is not None:
+        kind, field, names = "pattern", "pattern", patterns.names
+    exposure = getattr(exposures, kind)
     todo: list[dict[str, Any]] = [*ends]
     for factor in plan.brackets:
         for i, name in enumerate(names):
             if plan.lit_every and i % plan.lit_every == 0:
                 todo.append({"kind": "all_on"})
-            todo.append({"kind": "olat", "light": name, "exposure": exposures.olat * factor})
+            todo.append({"kind": kind, field: name, "exposure": exposure * factor})
     if plan.lit_every and names:
         todo.append({"kind": "all_on"})
     every = defaults.tracking_every if plan.tracking_every is None else plan.tracking_every

@@ -106,7 +106,8 @@ class World:
 
 
 class Lights(socketserver.BaseRequestHandler):
-    """Modbus TCP by hand: functions 3 (levels, sequence and table), 4, 6 and 16."""
+    """Modbus TCP by hand: functions 3 (levels, sequence and table), 4, 6, 15 (lamps from the first
+    on) and 16."""
 
     def handle(self) -> None:
         world: World = self.server.world  # type: ignore[attr-defined]
@@ -132,6 +133,12 @@ class Lights(socketserver.BaseRequestHandler):
             holding = {1003: [world.armed], 1004: world.owner, 0: world.levels}.get(address)
             words = (holding or world.table[address - 2000 :])[:value]
             return struct.pack(f">BB{value}H", 3, 2 * value, *words)
+        if function == 15:
+            on = [bool(pdu[6 + i // 8] >> i % 8 & 1) for i in range(value)]
+            if address or world.armed:
+                return struct.pack(">BB", 0x8F, 4)
+            world.light(set() if world.dead_lamps else {i for i, lit in enumerate(on) if lit})
+            return pdu[:5]
         if function == 16:
             if value > 123:
                 return struct.pack(">BB", 0x90, 3)

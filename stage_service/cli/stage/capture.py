@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
     check.add_argument(
         "--rig", type=rig_path, help="check against this rig file instead of a service"
     )
-    check.add_argument("--plan", type=Path, help=PLAN)
+    _add_plan(check)
     add_requested(start)
     start.add_argument(
         "--armed-by",
@@ -62,9 +62,35 @@ def add(commands: Commands) -> None:
             parser.add_argument("--armed-by", help="as for start")
 
 
+def _add_plan(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--plan", type=Path, help=PLAN)
+    parser.add_argument(
+        "--patterns",
+        metavar="KIND_OR_TABLE",
+        help="patterns of lights, not single ones: s_matrix, gradients, or a table (.csv, .json)",
+    )
+
+
+def _plan_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The plan of `_add_plan`'s options."""
+    from reconstruction.capture.light_patterns import PatternError, read_table
+
+    plan = read_json(args.plan)
+    if args.patterns in ("s_matrix", "gradients"):
+        return plan | {"patterns": args.patterns}
+    if args.patterns is None:
+        return plan
+    try:
+        rows = read_table(Path(args.patterns)).items()
+    except PatternError as error:
+        raise BadArgument(f"--patterns: {error}") from error
+    # what is off is left out: a request has few values
+    return plan | {"patterns": {n: {x: w for x, w in row.items() if w} for n, row in rows}}
+
+
 def add_requested(parser: argparse.ArgumentParser) -> None:
     """Add the options of a capture: plan, head, masks, pipeline."""
-    parser.add_argument("--plan", type=Path, help=PLAN)
+    _add_plan(parser)
     parser.add_argument("--head", type=Path, help="the digitised head (.obj)")
     parser.add_argument("--masks", type=Path, help="folder of hair masks, <camera>.png")
     parser.add_argument("--upload", help="name of a subject whose head and masks were uploaded")
@@ -73,7 +99,7 @@ def add_requested(parser: argparse.ArgumentParser) -> None:
 
 def requested(args: argparse.Namespace) -> dict[str, Any]:
     """The request body made of `add_requested`'s options."""
-    body: dict[str, Any] = {"plan": read_json(args.plan)}
+    body: dict[str, Any] = {"plan": _plan_of(args)}
     for field in ("head", "masks"):
         if getattr(args, field) is not None:
             body[field] = str(getattr(args, field).resolve())
@@ -94,10 +120,10 @@ def run_check(args: argparse.Namespace, output: Output, service: ServiceClient) 
         from stage_service.plan.capture_plan import CapturePlan
         from stage_service.plan.resolved import resolve
 
-        plan = parse_options(CapturePlan, read_json(args.plan), f"{args.plan}: plan")
+        plan = parse_options(CapturePlan, _plan_of(args), f"{args.plan}: plan")
         cost = resolve(plan, load_rig_file(args.rig)).cost.model_dump(mode="json")
     else:
-        cost = service.post("/plans:validate", read_json(args.plan))
+        cost = service.post("/plans:validate", _plan_of(args))
     output.result(cost, _costed(cost))
 
 

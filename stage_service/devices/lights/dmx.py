@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from stage_service.device_config import DmxLightsConfig
 from stage_service.devices.lights import limits
@@ -30,8 +30,8 @@ class DmxBank(ABC):
         self._first, self._width = config.first_channel - 1, config.channels
         self.universes = self.place(lamps - 1)[0] + 1
         self._steps = config.level_steps()
-        self._level = 1.0
-        self._on: range = range(0)
+        self._level = self._steps
+        self._on: dict[int, int] = {}  # levels of the lamps that are on, n / `_steps`
         self._lock = threading.RLock()
 
     def place(self, lamp: int) -> tuple[int, int]:
@@ -45,22 +45,27 @@ class DmxBank(ABC):
     def select(self, lamp: int) -> None:
         if not 0 <= lamp < self.count:
             raise ValueError(f"{self.name}: lamps are 0 to {self.count - 1}, got {lamp}")
-        self._show(range(lamp, lamp + 1), self._level, f"putting lamp {lamp} on")
+        self._show([lamp], f"putting lamp {lamp} on")
 
     def all_on(self) -> None:
-        self._show(range(self.count), self._level, "putting all lamps on")
+        self._show(range(self.count), "putting all lamps on")
+
+    def show(self, levels: Sequence[float]) -> None:
+        doing = "putting lamps on at levels of their own"
+        words = limits.level_words(self.name, doing, levels, self.count, self._steps)
+        self._put({lamp: word for lamp, word in enumerate(words) if word}, doing)
 
     def off(self) -> None:
-        self._show(range(0), self._level, "putting all lamps off")
+        self._show((), "putting all lamps off")
 
     def set_level(self, level: float) -> None:
         """Set the level of the lamps that are on, and of the next ones."""
         doing = f"setting the level to {level:g}"
-        limits.level_word(self.name, doing, level, self._steps)
+        word = limits.level_word(self.name, doing, level, self._steps)
         with self._lock:
-            if self._on and level != self._level:
-                self._show(self._on, level, doing)
-            self._level = level
+            if set(self._on.values()) - {word}:
+                self._put(dict.fromkeys(self._on, word), doing)
+            self._level = word
 
     def set_watchdog(self, seconds: float) -> None:
         raise limits.cannot(self.name, f"setting the watchdog to {seconds:g} s", "a watchdog")
@@ -91,11 +96,13 @@ class DmxBank(ABC):
     def _transmit(self, frames: Sequence[bytes], doing: str) -> None:
         """Send a frame of 512 channels to each universe; returns once the lamps have it."""
 
-    def _show(self, on: range, level: float, doing: str) -> None:
+    def _show(self, lamps: Iterable[int], doing: str) -> None:
+        self._put(dict.fromkeys(lamps, self._level), doing)
+
+    def _put(self, on: dict[int, int], doing: str) -> None:
         frames = [bytearray(CHANNELS) for _ in range(self.universes)]
-        for lamp in on:
+        for lamp, word in on.items():
             universe, channel = self.place(lamp)
-            word = round(level * self._steps)
             frames[universe][channel : channel + self._width] = bytes([word] * self._width)
         with self._lock:
             self._transmit([bytes(frame) for frame in frames], doing)

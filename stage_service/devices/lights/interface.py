@@ -87,6 +87,10 @@ class LightBank(Protocol):
     def all_on(self) -> None:
         """Put every lamp on, and confirm it where the link can."""
 
+    def show(self, levels: Sequence[float]) -> None:
+        """Put each lamp on at its level `(count,)`, 0 to 1, and those at 0 off; confirm the number
+        of lit ones where the link can. `set_level` is needed again before other commands."""
+
     def off(self) -> None:
         """Put every lamp off and leave a sequence; confirm it where the link can."""
 

@@ -86,6 +86,17 @@ class LimitedLightBank:
             with self._confirming():
                 self._bank.all_on()
 
+    def show(self, levels: Sequence[float]) -> None:
+        lamps = [lamp for lamp, level in enumerate(levels) if level > 0]
+        doing = f"putting {len(lamps)} lamps on at levels of their own"
+        if not lamps or not all(0 <= level <= 1 for level in levels):
+            raise ValueError(f"{self.name}: {doing}: expected levels of 0 to 1, at least one lit")
+        with lighting(doing), self._changed:
+            self._allow(lamps, doing, sum(levels) / len(lamps))
+            self._level = max(self._level, *levels)  # which the bank may keep
+            with self._confirming():
+                self._bank.show(levels)
+
     def off(self) -> None:
         """Put every lamp off; never refused. An error names what may still be lit."""
         with self._changed:
@@ -161,11 +172,12 @@ class LimitedLightBank:
                 return AGAIN_S
             return self._limits.max_on_s
 
-    def _allow(self, lamps: Sequence[int], doing: str) -> None:
-        """Count these lamps as lit from now on. Raises `SafetyRefusal`."""
+    def _allow(self, lamps: Sequence[int], doing: str, level: float | None = None) -> None:
+        """Count these lamps as lit from now on; `level` is their mean, None the level that was set.
+        Raises `SafetyRefusal`."""
         self._raise_refusal()
         self._check_lamps(len(lamps), doing)
-        self._check_power(len(lamps), self._level, doing)
+        self._check_power(len(lamps), self._level if level is None else level, doing)
         self._lit(lamps)
         now = self._clock()
         left, lamp = min((self._left(x, now), x) for x in lamps)
@@ -244,7 +256,8 @@ class LimitedLightBank:
         most = self._limits.max_lamps
         if most is not None and lamps > most:
             expected = f"at most {most} lamps lit (max_lamps in [safety])"
-            todo = "Leave the sentinels out of the plan (sentinels = false)."
+            todo = "Leave the sentinels out of the plan (sentinels = false), or light fewer in a "
+            todo += "pattern."
             raise self._error(doing, expected, f"{lamps} requested", todo)
 
     def _check_power(self, lamps: int, level: float, doing: str) -> None:

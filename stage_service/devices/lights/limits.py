@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from stage_service.devices.errors import DeviceError
 from stage_service.devices.lights.interface import LightCapabilities
 
@@ -30,6 +32,18 @@ def level_word(name: str, doing: str, level: float, steps: int) -> int:
         todo = "Use a shorter exposure at a higher level."
         raise DeviceError(name, doing, expected, f"{level:g}", todo)
     return round(level * steps)
+
+
+def level_words(
+    name: str, doing: str, levels: Sequence[float], lamps: int, steps: int
+) -> list[int]:
+    """`level_word` of each lamp. Raises `ValueError` for another number of lamps, `DeviceError` for
+    a level between 0 and 1 where lamps are on or off."""
+    if len(levels) != lamps:
+        raise ValueError(f"{name}: expected levels of {lamps} lamps, got {len(levels)}")
+    if steps == 1 and any(0 < level < 1 for level in levels):
+        raise cannot(name, doing, "levels")
+    return [level_word(name, doing, level, steps) for level in levels]
 
 
 def cannot(name: str, doing: str, lacks: str) -> DeviceError:

@@ -10,18 +10,13 @@ from stage_service.device_config import OWNER_WORDS, ModbusRtuConfig, ModbusTcpC
 from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import limits
 from stage_service.devices.lights import modbus_frames as frames
+from stage_service.devices.lights import modbus_links as links
 from stage_service.devices.lights.interface import (
     LightCapabilities,
     LightStatus,
     Lit,
     lamps_lit,
     mismatch_todo,
-)
-from stage_service.devices.lights.modbus_links import (
-    ModbusLink,
-    NoReply,
-    WrongReply,
-    open_link,
 )
 from stage_service.devices.lights.modbus_registers import (
     TABLE_ENTRIES,
@@ -66,7 +61,7 @@ class ModbusLightBank:
         self._level: int | None = None
         self._armed: int | None = None  # entries; None: not known
         self._owner = 0
-        self._link: ModbusLink | None = None
+        self._link: links.ModbusLink | None = None
         self._identified = False
         self._out_of_step = False
         self._resyncs = 0
@@ -96,6 +91,20 @@ class ModbusLightBank:
 
     def all_on(self) -> None:
         self._command(ALL_ON, self.count, "putting all lamps on")
+
+    def show(self, levels: Sequence[float]) -> None:
+        doing = "putting lamps on at levels of their own"
+        words = limits.level_words(self.name, doing, levels, self.count, self.config.level_steps())
+        on = [word > 0 for word in words]
+        with self._lock:
+            self._trust()
+            self._put(ALL_OFF, doing)  # lamps that are on would take the new levels
+            if self._map.levels is not None:
+                self._level = None
+                self._write(words, self._map.levels, doing)
+            self._switch(on, doing)
+            if self.capabilities.reads_back:
+                self._confirm(sum(on), doing)
 
     def off(self) -> None:
         doing = "putting all lamps off"
@@ -239,7 +248,10 @@ class ModbusLightBank:
         if self._map.selector is not None:
             self._exchange(doing, "write_register", self._map.selector, selector)
             return
-        on = [selector in (ALL_ON, lamp + 1) for lamp in range(self.count)]
+        self._switch([selector in (ALL_ON, lamp + 1) for lamp in range(self.count)], doing)
+
+    def _switch(self, on: Sequence[bool], doing: str) -> None:
+        """Write every lamp's coil."""
         starts = range(0, self.count, MOST_COILS)
         # Chunks without a lit lamp first, so that never two lamps are on.
         for start in sorted(starts, key=lambda s: any(on[s : s + MOST_COILS])):
@@ -327,7 +339,7 @@ class ModbusLightBank:
         if self._link is not None:
             return
         try:
-            self._link = open_link(self.config)
+            self._link = links.open_link(self.config)
             if self._out_of_step:
                 # Late replies may still come: drop them.
                 self._link.drain(self.config.timeout_s)
@@ -348,9 +360,9 @@ class ModbusLightBank:
         sent = frames.request(method, address, payload)
         try:
             reply = self._link.exchange(sent)
-        except (NoReply, OSError) as error:
+        except (links.NoReply, OSError) as error:
             raise self._no_reply(doing, error) from error
-        except WrongReply as other:
+        except links.WrongReply as other:
             raise self._other_reply(
                 doing, f"{frames.expected(sent)}, {other.expected}", other
             ) from other
@@ -363,25 +375,13 @@ class ModbusLightBank:
             raise self._other_reply(doing, frames.expected(sent), frames.shown(reply))
         return reply
 
-    def _no_reply(self, doing: str, error: NoReply | OSError) -> DeviceError:
+    def _no_reply(self, doing: str, error: links.NoReply | OSError) -> DeviceError:
         """The error where no reply came; closes the link."""
         self.close()
         left = "its watchdog switches the lamps off"
         if not self.capabilities.dead_man:
             left = "its lamps may still be lit"
-        todo = f"Check power and cable of the bank; {left}."
-        timeout_s = self.config.timeout_s
-        if isinstance(error, OSError):
-            got = f"none ({error})"
-            return DeviceUnreachable(self.name, doing, "a reply", got, todo, timeout_s)
-        got = frames.unusable(error.received)
-        if error.echo:
-            got = "only an echo of the request"
-            if isinstance(self.config, ModbusRtuConfig):
-                todo += f" The adapter on {self.config.port} echoes: switch its local echo off."
-            else:
-                todo = f"The device there is no light bank: check host and port; {left}."
-        return DeviceTimeout(self.name, doing, "a reply", got, todo, timeout_s)
+        return links.no_reply(self.name, doing, error, self.config, left)
 
     def _other_reply(self, doing: str, expected: str, received: object) -> _OutOfStep:
         """The error for a reply to another request; closes the link."""

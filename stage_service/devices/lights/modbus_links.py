@@ -16,6 +16,7 @@ import time
 from abc import ABC, abstractmethod
 
 from stage_service.device_config import ModbusRtuConfig, ModbusTcpConfig
+from stage_service.devices.errors import DeviceError, DeviceTimeout, DeviceUnreachable
 from stage_service.devices.lights import modbus_frames as frames
 from stage_service.devices.serial_ports import ExclusivePort
 
@@ -43,6 +44,28 @@ class WrongReply(Exception):
     def __init__(self, expected: str, received: str) -> None:
         super().__init__(received)
         self.expected, self.received = expected, received
+
+
+def no_reply(
+    name: str,
+    doing: str,
+    error: NoReply | OSError,
+    config: ModbusTcpConfig | ModbusRtuConfig,
+    left: str,
+) -> DeviceError:
+    """The error of the bank `name` where no reply came; `left` is what becomes of its lamps."""
+    todo = f"Check power and cable of the bank; {left}."
+    if isinstance(error, OSError):
+        got = f"none ({error})"
+        return DeviceUnreachable(name, doing, "a reply", got, todo, config.timeout_s)
+    got = frames.unusable(error.received)
+    if error.echo:
+        got = "only an echo of the request"
+        if isinstance(config, ModbusRtuConfig):
+            todo += f" The adapter on {config.port} echoes: switch its local echo off."
+        else:
+            todo = f"The device there is no light bank: check host and port; {left}."
+    return DeviceTimeout(name, doing, "a reply", got, todo, config.timeout_s)
 
 
 def silence_s(config: ModbusRtuConfig) -> float:

@@ -52,9 +52,10 @@ export function formOf(schema, defs, { hints = {}, skip = [], onchange }) {
       return { input, read: () => (input.checked === kind.default ? undefined : input.checked), write: (v) => { input.checked = v ?? kind.default; } };
     }
     if (kind.enum) {
-      const input = h("select", kind.enum.map((x) => h("option", { value: x }, x)));
-      input.value = kind.default ?? kind.enum[0];
-      return { input, read: () => (input.value === kind.default ? undefined : input.value), write: (v) => { input.value = v ?? kind.default; } };
+      const first = kind.default ?? (kind.nullable ? "" : kind.enum[0]);
+      const input = h("select", (kind.nullable ? ["", ...kind.enum] : kind.enum).map((x) => h("option", { value: x }, x || "–")));
+      input.value = first;
+      return { input, read: () => (input.value === first ? undefined : input.value), write: (v) => { input.value = v ?? first; } };
     }
     if (kind.type === "number" || kind.type === "integer") {
       const input = h("input", { type: "number", step: kind.type === "integer" ? 1 : "any", min: kind.minimum ?? kind.exclusiveMinimum, max: kind.maximum, placeholder: hint ?? (kind.default ?? "") });

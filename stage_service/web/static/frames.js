@@ -145,7 +145,7 @@ function captureOf(view, id) {
     setContent(play, "film");
   }
 
-  const words = (s) => ({ olat: s.light, scanline: `${s.projector}, row ${s.row}`, all_on: "all lights", tracking: "all projectors" }[s.kind] ?? "dark");
+  const words = (s) => ({ olat: s.light, pattern: `pattern ${s.pattern}`, scanline: `${s.projector}, row ${s.row}`, all_on: "all lights", tracking: "all projectors" }[s.kind] ?? "dark");
 
   async function show() {
     const step = chosen[slider.value];

@@ -167,12 +167,12 @@ export function open(view) {
     const last = silence() && busy() && p ? p : {}; // lit at the last contact with the service
     const shot = new Set((steps ?? []).slice(0, c.step).map((s) => s.light).filter(Boolean));
     picture.show({
-      lit: now.kind === "all_on" ? "all" : now.light ?? null,
+      lit: now.kind === "all_on" || now.kind === "pattern" ? "all" : now.light ?? null,
       shot, missing: lacking(),
       projector: now.kind === "tracking" ? "all" : now.projector ?? null,
-      doubt: last.kind === "all_on" ? new Set(S.rig.lights.map((x) => x.name)) : last.light ? new Set([last.light]) : suspects(),
+      doubt: last.kind === "all_on" || last.kind === "pattern" ? new Set(S.rig.lights.map((x) => x.name)) : last.light ? new Set([last.light]) : suspects(),
     });
-    const what = !running || !now.kind ? (busy() ? STATE_TEXT[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
+    const what = !running || !now.kind ? (busy() ? STATE_TEXT[c.state] || "about to begin" : "nothing is lit") : { olat: now.light, pattern: `lights of pattern ${now.pattern}`, all_on: "all lights", dark: "no light: a dark frame", tracking: "all projectors", scanline: `${now.projector}, row ${now.row}` }[now.kind];
     waitsAt(running && p && !p.by_box ? `${c.id} ${p.step}` : null);
     const responded = waits.slow && p.here ? ` · ${number(p.here)} of ${number(S.rig.cameras.length)} cameras have responded` : "";
     const w = running ? p?.waiting : null;

@@ -11,6 +11,7 @@ const spread = (lights, n) => lights.filter((_, i) => Math.floor((i * n) / light
 const PRESETS = {
   "everything": () => ({}),
   "lights only": () => ({ projectors: [] }),
+  "patterns of lights": () => ({ patterns: "s_matrix", projectors: [] }),
   "sweep only": () => ({ lights: [] }),
   "quick look: 12 lights": () => ({ lights: spread(S.rig.lights, 12), projectors: [] }),
   "slow, for eyes": () => ({ rate_hz: 2.5 }),

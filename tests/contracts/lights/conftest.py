@@ -208,6 +208,10 @@ class Foreign(DataHandler):  # type: ignore[misc]
     def read_h_regs(self, address: int, count: int, srv_info: Any) -> Any:
         return self.Return(0, [self.holding[a] for a in range(address, address + count)])
 
+    def write_coils(self, address: int, bits_l: list[bool], srv_info: Any) -> Any:
+        self.on[address : address + len(bits_l)] = bits_l
+        return self.Return(0)
+
     def write_h_regs(self, address: int, words_l: list[int], srv_info: Any) -> Any:
         if address == 1002 and not 100 <= words_l[0] <= 60000:
             return self.Return(3)

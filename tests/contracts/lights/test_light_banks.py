@@ -55,6 +55,62 @@ def test_the_bank_lights_exactly_the_commanded_lamps(any_bank):
     assert any_bank.lit() == []
 
 
+GRADED = [round(i / 199, 2) for i in range(200)]
+
+
+def test_several_lamps_are_lit_at_once_each_at_its_own_level(any_bank):
+    driver = any_bank.driver
+    driver.all_on()
+    some = [float(i in (1, 8, 198)) for i in range(200)]
+    driver.show(some)
+    assert any_bank.lit() == [1, 8, 198]
+    driver.set_level(1.0)
+    driver.select(2)
+    assert any_bank.lit() == [2]
+    for wrong in ([1.0], [*some, 1.0], [2.0, *some[1:]], [-0.1, *some[1:]]):
+        with pytest.raises(ValueError, match="level"):
+            driver.show(wrong)
+    assert any_bank.lit() == [2]
+    driver.show(some)
+    driver.off()
+    assert any_bank.lit() == []
+
+
+@pytest.mark.parametrize("kind", [k for k in ALL if k != "simulated TCP, coils alone"])
+def test_levels_of_several_lamps_are_as_commanded(bench, kind):
+    one = bench(kind)
+    one.driver.set_level(0.25)
+    one.driver.show(GRADED)
+    np.testing.assert_allclose(one.powers(), GRADED, atol=0.5 / 255)
+    assert one.lit() == list(range(1, 200))
+    one.driver.set_level(0.25)  # as before, but no lamp has it any more
+    np.testing.assert_allclose([one.powers()[i] for i in one.lit()], 0.25, atol=0.5 / 255)
+    one.driver.all_on()
+    np.testing.assert_allclose(one.powers(), 0.25, atol=0.5 / 255)
+
+
+def test_a_bank_without_levels_refuses_grey_before_a_lamp_changes(bench):
+    one = bench("simulated TCP, coils alone")
+    one.driver.select(3)
+    with pytest.raises(DeviceError, match="expected levels, received a light bank without"):
+        one.driver.show(GRADED)
+    assert one.lit() == [3]
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_no_lamp_takes_another_pattern_s_level(bench, kind, monkeypatch):
+    """While the levels of a pattern are written, all lamps are off."""
+    one = bench(kind)
+    one.driver.all_on()
+    seen = []
+    dim = one.lamps.dim
+    monkeypatch.setattr(
+        one.lamps, "dim", lambda *words: (seen.append(one.lamps.power().any()), dim(*words))
+    )
+    one.driver.show(GRADED)
+    assert seen == [False, False]  # 122 levels, then the rest
+
+
 def test_lamps_that_are_not_there_are_refused(any_bank):
     for lamp in (-1, 200):
         with pytest.raises(ValueError, match=f"lamps are 0 to 199, got {lamp}"):

@@ -47,6 +47,9 @@ class Bank:
     def all_on(self) -> None:
         self.lit = set(range(self.count))
 
+    def show(self, levels: Sequence[float]) -> None:
+        self.lit = {i for i, level in enumerate(levels) if level > 0}
+
     def off(self) -> None:
         if self.dead:
             raise DeviceTimeout("lights", "off", expected="", received="", todo="")
@@ -241,6 +244,61 @@ def test_lamps_and_power_are_checked_before_anything_lights(limited):
     with pytest.raises(SafetyRefusal, match="entry 0"):
         lights.load_sequence([("all", 0.25)])
     assert bank.lit == set(range(LAMPS))
+
+
+def levels_of(**levels: float) -> list[float]:
+    return [levels.get(f"lamp_{i}", 0.0) for i in range(LAMPS)]
+
+
+def test_the_lamps_of_a_pattern_are_counted_and_their_power_added(limited):
+    bank, lights, _ = limited(max_lamps=3, max_power_w=15.0, lamp_power_w=10.0)
+    lights.show(levels_of(lamp_0=1.0, lamp_4=0.25, lamp_9=0.25))  # 15 W
+    assert bank.lit == {0, 4, 9}
+    with pytest.raises(SafetyRefusal, match=r"at most 15 W .*received 2 lamps at level 0\.8, 16 W"):
+        lights.show(levels_of(lamp_0=1.0, lamp_1=0.6))
+    with pytest.raises(SafetyRefusal, match=r"at most 3 lamps lit .*received 4 requested"):
+        lights.show(levels_of(lamp_0=0.1, lamp_1=0.1, lamp_2=0.1, lamp_3=0.1))
+    with pytest.raises(SafetyRefusal, match="3 lamps at level 1, 30 W"):
+        lights.set_level(1.0)  # of the lamps that the pattern has lit
+    assert bank.lit == {0, 4, 9}
+
+
+def test_after_a_pattern_lamps_may_have_its_highest_level(limited):
+    """A bank whose level registers a pattern has written keeps them."""
+    _, lights, _ = limited(max_power_w=15.0, lamp_power_w=10.0)
+    lights.set_level(0.1)
+    lights.show(levels_of(lamp_0=0.9, lamp_1=0.1))
+    lights.off()
+    with pytest.raises(SafetyRefusal, match=r"10 lamps at level 0\.9, 90 W"):
+        lights.all_on()
+    lights.set_level(0.1)
+    lights.all_on()
+
+
+def test_each_lamp_of_a_pattern_has_its_own_time_and_duty(limited):
+    bank, lights, clock = limited(max_on_s=5.0, max_duty=0.5, duty_window_s=10.0)
+    lights.select(3)
+    clock.now += 3.0
+    lights.show(levels_of(lamp_3=0.1, lamp_4=1.0))
+    assert lights.enforce() == pytest.approx(2.0), "lamp 3 was lit before, however dim now"
+    clock.now += 2.0
+    lights.enforce()
+    assert bank.lit == set()
+    lights.off()
+    lights.connect()
+    clock.now += 1.0
+    with pytest.raises(SafetyRefusal, match=r"lit for 5 s.*Let the lamp cool"):
+        lights.show(levels_of(lamp_3=0.1, lamp_5=1.0))
+    lights.show(levels_of(lamp_4=0.1, lamp_5=1.0))
+    assert bank.lit == {4, 5}
+
+
+def test_a_pattern_that_is_none_lights_nothing(limited):
+    bank, lights, _ = limited()
+    for wrong in (levels_of(), levels_of(lamp_0=1.1), levels_of(lamp_0=float("nan"), lamp_1=1.0)):
+        with pytest.raises(ValueError, match="levels of 0 to 1, at least one lit"):
+            lights.show(wrong)
+    assert bank.lit == set()
 
 
 @pytest.fixture(scope="module")
