@@ -79,7 +79,7 @@ function captureOf(view, id) {
   const acts = h(".line");
   const slider = h("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "step", oninput: () => { stopFilm(); show(); } });
   const where = h("output", "");
-  const kinds = h("select", { "aria-label": "steps by kind", onchange: pick }, [["olat", "each light"], ["scanline", "the sweep"], ["all", "all steps"]].map(([v, t]) => h("option", { value: v }, t)));
+  const kinds = h("select", { "aria-label": "steps by kind", onchange: pick }, [["olat", "each light"], ["pattern", "each pattern"], ["scanline", "the sweep"], ["all", "all steps"]].map(([v, t]) => h("option", { value: v }, t)));
   const same = h("input", { type: "checkbox", checked: true, onchange: () => { white = null; show(); } });
   const marked = h("input", { type: "checkbox", onchange: show });
   const figures = h("input", { type: "checkbox", onchange: show });
@@ -101,7 +101,7 @@ function captureOf(view, id) {
       return;
     }
     showFacts();
-    if (!steps.some((s) => s.kind === kinds.value)) kinds.value = steps.some((s) => s.kind === "scanline") ? "scanline" : "all";
+    if (!steps.some((s) => s.kind === kinds.value)) kinds.value = ["scanline", "pattern"].find((kind) => steps.some((s) => s.kind === kind)) ?? "all";
     pick();
   }
 

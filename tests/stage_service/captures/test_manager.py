@@ -10,17 +10,21 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from waiting import until as waited
 
+from reconstruction import Capture
 from stage_service.acquisition.states import WrongState
+from stage_service.captures.capture_run import plan_of
 from stage_service.captures.manager import CaptureManager
 from stage_service.captures.may_light import NotNow
 from stage_service.config import RigFile
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import PlanError
 
 SHORT = CapturePlan(lights=("light_003", "light_000"), projectors=())
 LONG = CapturePlan(projectors=())
@@ -84,6 +88,37 @@ def test_a_capture_for_which_no_thread_can_be_had_keeps_nobody_from_anything(
     monkeypatch.undo()
     manager.resume(status.id)
     assert manager.wait(status.id, 20).outcome == "completed"
+
+
+PATTERNS = CapturePlan(
+    patterns={"grey": {"light_003": 0.5, "light_004": 1.0}}, projectors=(), sentinels=False
+)
+
+
+def test_a_plan_of_patterns_is_recorded_and_found_again(manager, rig_file, completed):
+    capture_id = manager.start(PATTERNS)
+    assert manager.wait(capture_id, 20).outcome == "completed"
+    capture = Capture(manager.path(capture_id))
+    assert capture.lightings() == ["grey"]
+    assert capture.patterns.lights == ("light_003", "light_004")
+    assert plan_of(capture, rig_file).steps == capture.steps
+    coarse = rig_file.devices.lights.registers.model_copy(update={"level_full": 25})
+    lights = rig_file.devices.lights.model_copy(update={"registers": coarse})
+    devices = rig_file.devices.model_copy(update={"lights": lights})
+    with pytest.raises(PlanError, match=r"\[devices\] has changed since this capture"):
+        plan_of(capture, replace(rig_file, devices=devices))
+
+
+def test_a_pattern_over_the_limit_is_refused_before_anything_is_lit(
+    manager, world, rig_file, monkeypatch
+):
+    lit = []
+    world.put_on = lit.append
+    limits = rig_file.safety.model_copy(update={"max_power_w": 0.59})
+    monkeypatch.setattr(manager, "rig_file", replace(rig_file, safety=limits))
+    with pytest.raises(PlanError, match=r"2 lamps of grey at level 0\.0399939 draw 0\.5998 W"):
+        manager.start(PATTERNS)
+    assert (lit, manager.list(), manager.running) == ([], [], None)
 
 
 def test_blackout_without_a_capture(manager, world):
@@ -205,9 +240,11 @@ def test_a_damaged_capture_is_listed_with_its_reason_and_harms_no_other(manager,
 PROCESS = """
 import sys, time
 from pathlib import Path
+from stage_service.captures.capture_run import plan_of
 from stage_service.captures.manager import CaptureManager
 from stage_service.config import load_rig_file
 from stage_service.plan.capture_plan import CapturePlan
+from stage_service.plan.resolved import PlanError
 manager = CaptureManager(load_rig_file(sys.argv[1]), Path(sys.argv[2]))
 manager.stage.darken()
 manager.start(CapturePlan(projectors=()))

@@ -568,3 +568,22 @@ def test_a_plan_is_checked_without_a_service(capsys, tmp_path):
         3,
         f"{plan}: plan.speed: Extra inputs are not permitted, got 1",
     )
+
+
+def test_a_plan_of_patterns_from_a_table_is_checked(capsys, tmp_path):
+    """Light 7 of the table is light_007 of the rig; what is off is not sent."""
+    words = ("capture", "check", "--rig", RIGS / "stage331.toml", "--patterns")
+    table = tmp_path / "table.csv"
+    table.write_text("pattern,light_000,7\nleft,1,0\nboth,0.5,1\n")
+    code, cost = run(capsys, *words, table, "--plan", '{"projectors": []}')
+    assert (code, cost["frames_by_kind"]["pattern"]) == (0, 50 * 2)
+    code, cost = run(capsys, *words, "gradients", "--plan", '{"projectors": []}')
+    assert (code, cost["frames_by_kind"]["pattern"]) == (0, 50 * 7)
+    table.write_text("pattern,lamp\nleft,1\n")
+    code, data = run(capsys, *words, table)
+    assert (code, "there is no light 'lamp'" in data["error"]["detail"]) == (3, True)
+    code, data = run(capsys, *words, tmp_path / "s_matrix.txt")
+    assert (code, "expected a table of patterns (.csv, .json)" in data["error"]["detail"]) == (
+        3,
+        True,
+    )

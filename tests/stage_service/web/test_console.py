@@ -95,6 +95,28 @@ def test_a_lease_taken_while_the_page_loads_is_shown(console):
     page.wait_for_selector("text=Eve steers", timeout=10_000)
 
 
+def test_patterns_of_lights_are_planned_and_shot(console):
+    """31 patterns of 24 lights, and the frames before and after them, of two cameras."""
+    http, pages = console()
+    page = pages.open("plan")
+    page.click("text=patterns of lights")
+    assert page.input_value("[name=patterns]") == "s_matrix"
+    page.wait_for_selector(f".cost dl:has-text('{2 * (31 + 4)}')")
+    page.select_option("[name=patterns]", "")
+    page.wait_for_selector(f".cost dl:has-text('{2 * (24 + 4)}')")
+    page.select_option("[name=patterns]", "gradients")
+    page.wait_for_selector(f".cost dl:has-text('{2 * (7 + 4)}')")
+    page.click("button:text-is('Start now')")
+    page.fill("[name=holder]", "Ada")
+    page.click("dialog button")
+    says(page, "Dark, verified")
+    (capture,) = http.get("/captures").json()
+    steps = http.get(f"/captures/{capture['id']}/steps").json()
+    assert [s["pattern"] for s in steps if s["pattern"]][:2] == ["full", "x"]
+    page.goto(page.url.partition("#")[0] + f"#frames/{capture['id']}")
+    page.wait_for_selector("text=pattern full")
+
+
 def test_invalid_numbers_in_fields_are_refused(console):
     http, pages = console()
     page = pages.open("plan")
