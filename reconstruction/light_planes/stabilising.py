@@ -43,7 +43,7 @@ from reconstruction.report.report import Progress, Stage, silent
 VOXEL = 3e-3  # metres; a millimetre of depth is 17 micrometres across at a turn by 1°
 WIDEST = 1300  # pixels of the reduced images that are registered, as Photobooth's
 LEAST_LIT, MOST_CLIPPED = 0.5, 0.3  # of the median brightness; of the lit pixels
-LOCAL = 2.0  # pixels
+LOCAL, BLUR = 2.0, 0.7  # pixels
 OUTLINE = 0.07  # of the root of a mask's area
 BLOCK = 0.02  # metres of a chequerboard in space
 JUMP = 4.0  # times the median motion between lit frames
@@ -66,8 +66,9 @@ def stabilise(source: Capture, out: Path, progress: Progress = silent) -> Stabil
     """Write the capture `out`, a new or empty folder, of `source` without the subject's motion.
 
     Nothing is written without two usable lit frames at different times, if no camera shows motion,
-    or if it is less than twice the estimated error. Frames whose pose is unknown are recorded as
-    missing. Raises `CaptureError` for a stabilised capture, and for one without a visual hull.
+    if it is less than twice the estimated error, or if the lit frames do not come closer to the
+    first one by it. Frames whose pose is unknown are recorded as missing. Raises `CaptureError` for
+    a stabilised capture, and for one without a visual hull.
     """
     if "stabilised" in source.plan:
         raise CaptureError(f"{source.path}: its motion has been corrected already")
@@ -95,6 +96,11 @@ def stabilise(source: Capture, out: Path, progress: Progress = silent) -> Stabil
             f"({figures['error_px']:.2g} px) in {len(steps)} lit frames"
         )
         return Stabilised(source, motion, unchanged + why, figures, tuple(stage.warnings))
+    before, after = solver.differences(motion)
+    figures |= {"lit_difference_as_shot": before, "lit_difference_stabilised": after}
+    differ = f"lit frames differ from the first by {before:.1%} as shot, {after:.1%} stabilised"
+    if after >= before:
+        return Stabilised(source, motion, unchanged + differ, figures, tuple(stage.warnings))
     motion, jumps = solver.with_jumps(motion, figures["error_mm"] / 1e3, stage)
     figures["jumps"] = jumps
     motion = _referred(source, motion)
@@ -106,6 +112,7 @@ def stabilise(source: Capture, out: Path, progress: Progress = silent) -> Stabil
     )
     if "left_out_mm" in figures:
         summary += f"; a lit frame that is left out, {figures['left_out_mm']:.2g} mm"
+    summary += f"; {differ}"
     return Stabilised(Capture(out), motion, summary, figures, tuple(stage.warnings))
 
 
@@ -232,6 +239,26 @@ class _Solver:
             ]
             out["left_out_mm"] = 1e3 * float(np.sqrt(np.mean(np.square(left_out))))
         return out
+
+    def differences(self, motion: Motion) -> tuple[float, float]:
+        """Relative difference, root mean square, of lit frames from the first one in reduced images
+        of the hull, as shot and stabilised; blurred by `BLUR`, as resampling blurs noise."""
+        first, *others = [s for s in self.steps if motion.known([s.index])[0]]
+        off, size = np.zeros(2), 0.0
+        for camera in self.view.rig.cameras:
+            if camera.name not in self.points or not self.view.has(first, camera.name):
+                continue
+            warp = Warp.of(camera, self.hull, 1)
+            on = np.isfinite(first_depth(camera, self.hull))
+            still = smooth(grey(self.view.frame(first, camera.name)), BLUR)[on]
+            for step in (s for s in others if self.view.has(s, camera.name)):
+                (turn,), (shift,) = motion.at(step.index)
+                image = self.view.frame(step, camera.name)
+                both = image, resampled(image, warp.maps(turn, shift))
+                off += [np.square(smooth(grey(x), BLUR)[on] - still).sum() for x in both]
+                size += float(np.square(still).sum())
+        before, after = np.sqrt(off / max(size, np.finfo(float).tiny))
+        return float(before), float(after)
 
     def apart(self, a: Pose, b: Pose) -> Array:
         """How far poses `(T, 3, 3), (T, 3)` put the points apart: root mean squares `(T, 2)`,

@@ -148,6 +148,8 @@ def test_a_drift_is_taken_off(sphere: MovingSphere, moving: Capture, tmp_path: P
     assert worst(found.motion, drift, sphere.steps()) < 0.5e-3
     assert found.figures["largest_mm"] == pytest.approx(6.64, abs=0.5)
     assert found.figures["error_mm"] < 0.6
+    before, after = (found.figures[f"lit_difference_{k}"] for k in ("as_shot", "stabilised"))
+    assert after < 0.35 * before
     assert off(sphere, found.capture) < 0.35 * off(sphere, moving)
     # lights are where the subject, in its first pose, had them
     light = moving.rig.light("light_8")
@@ -228,6 +230,17 @@ def test_a_motion_that_nothing_shows_is_not_called_still(
     assert "its motion is unknown" in found.summary
     assert found.capture is moving
     assert found.figures == {}
+
+
+def test_frames_that_come_no_closer_remain_as_they_are(
+    moving: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = Warp.maps
+    monkeypatch.setattr(Warp, "maps", lambda self, turn, shift: maps(self, turn.T, -shift))
+    found = stabilise(moving, tmp_path / "s")
+    assert "lit frames differ from the first by" in found.summary
+    assert found.capture is moving
+    assert not (tmp_path / "s").exists()
 
 
 @pytest.mark.parametrize("by", [1, 3])
