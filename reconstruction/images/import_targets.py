@@ -167,7 +167,7 @@ def _ball(understood: Import, circles: dict[str, Circle]) -> tuple[list[str], tu
     lines = ["[grey_ball]", "albedo = 0.18 # as measured", "[grey_ball.circles]", *lines]
     if len(circles) < 2:
         seen = f"only in {next(iter(circles))}" if circles else "in no camera"
-        return [], (f"a ball was found {seen}, expected two cameras or more",)
+        return [], (f"a grey ball was found {seen}, expected two cameras or more",)
     try:
         placed = PlacedBall.of(GreyBall(circles), understood.shot)
     except ValueError as error:

@@ -139,7 +139,9 @@ def run_import(args: argparse.Namespace, output: Output) -> None:
                 lamps = out.with_name(f"{out.name}-lights.json")
                 count = write_lights(understood, targets.lights, args.light_distance, lamps)
                 found = f"{lamps}: {count} lights, for --lights"
-                missing = "no light's distance is determined: give --light-distance, or 2 balls"
+                missing = (
+                    "no light's distance is determined: give --light-distance, or balls 0.3 m apart"
+                )
                 lines.append(found if count else missing)
         counts = understood.counts()
         output.result({"sheet": str(sheet), **data, **counts, "notes": notes}, "\n".join(lines))

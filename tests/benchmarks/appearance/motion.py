@@ -2,8 +2,8 @@
 
 A small stage shades each step in the pose of its time: a drift by so many millimetres and degrees
 over the capture, or a jump. Errors of the motion; of a single light's picture beside that of the
-still subject; of a left-out light by the three nearest ones; of directions in the images; with
-`--strands`, of strands. Leaves `motion.json` and `motion.md`.
+still subject; of a left-out light by the three nearest ones; with `--strands`, of strands. Leaves
+`motion.json` and `motion.md`.
 """
 
 from __future__ import annotations
@@ -37,22 +37,18 @@ from reconstruction import (
     reconstruct,
     write_strands,
 )
-from reconstruction.arrays import Array, Floats
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.geometry.lights import dome_positions
-from reconstruction.images.grey import grey
-from reconstruction.images.orientation import orientations
 from reconstruction.light_planes.stabilising import stabilise
-from reconstruction.reconstruct_options import LogGaborBank
 
 SEEDS = option("--seeds", "how many subjects, from --seed on", type=int, default=2)
 STRANDS = option("--strands", "score strands too: 3 CPU minutes a capture", action="store_true")
 DRIFTS = {"2 mm, 1°": (2e-3, 1.0), "5 mm, 2°": (5e-3, 2.0), "10 mm, 3°": (10e-3, 3.0)}
 JUMP = (5e-3, 2.0)
-STRIDE = 3
+STRIDE = 4
 """Of the strands' points."""
-BANK = LogGaborBank(wavelength=4.0, count=32)
-ALIGNED = 0.8
-"""Least mean doubled direction of the strands in a pixel whose direction is scored."""
+Points = tuple[Array, Array, Ints]
+"""Points `(N, 3)` of strands, their tangents, and the numbers of their strands."""
 Poses = Callable[[float], tuple[Array, Array]]
 
 
@@ -108,20 +104,19 @@ def plan(size: Size) -> list[Step]:
     return [Step(i, exposure=0.02, **k) for i, k in enumerate(kinds)]
 
 
-def shaded(subject: Subject, camera: Camera, lights: list[Light]) -> Floats:
+def shaded(hair: Points, camera: Camera, lights: list[Light]) -> Floats:
     """The sum of images `(H, W, 3)` under `lights` by Kajiya and Kay (1989), without shadows.
 
     Points of strands within 4 mm behind the first one in a pixel share it: no noise, which would
     hide a motion below a pixel.
     """
-    points, tangents = subject.strands.points[::STRIDE], subject.strands.tangents()[::STRIDE]
-    owner = subject.strands.strand_of_point[::STRIDE]
+    points, tangents, owner = hair
     visible, x, y, depth = camera.pixels_of(points)
     first = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(first, (y[visible], x[visible]), depth[visible])
     visible &= depth < first[y, x] + 4e-3
     p, t, dyed = points[visible], tangents[visible], owner[visible] * 0.618 % 1
-    out = p - np.median(subject.strands.points, axis=0)
+    out = p - np.median(points, axis=0)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     to_camera = camera.center - p
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
@@ -156,13 +151,18 @@ def shoot(path: Path, subject: Subject, size: Size, pose: Poses) -> Capture:
     shutil.rmtree(path, ignore_errors=True)
     rig, steps = stage(size, subject), plan(size)
     writer = CaptureWriter.create(path, rig, {"steps": steps}, head=subject.head)
-    records = []
+    strands, records = subject.strands, []
+    hair = (
+        strands.points[::STRIDE].astype(float),
+        strands.tangents()[::STRIDE].astype(float),
+        strands.strand_of_point[::STRIDE],
+    )
     for step in steps:
         turn, shift = pose(step.index / (len(steps) - 1))
         lights = [x.moved(turn, shift) for x in rig.lights if step.light in (None, x.name)]
         lights = lights[:: size.every // 2] if step.light is None else lights
         for camera in rig.cameras:
-            image = shaded(subject, camera.moved(turn, shift), lights)
+            image = shaded(hair, camera.moved(turn, shift), lights)
             records.append(writer.store_frame(step, camera.name, image))
     writer.commit(records)
     writer.finish("completed")
@@ -181,47 +181,19 @@ def motion_errors(found: Any, pose: Poses, steps: list[Step], points: Array) -> 
     return {"motion mm": float(mm), "motion °": float(deg)}
 
 
-def picture_errors(capture: Capture, still: Capture, hair: dict[str, Array]) -> dict[str, float]:
+def picture_errors(capture: Capture, still: Capture, hair: dict[str, Bools]) -> dict[str, float]:
     """Relative errors, root mean square over the hair, of frames and of left-out lights by their
     three nearest ones, beside the frames of the still subject."""
     lights = capture.olat_lights()
     off, left, size = np.zeros(3)
     for camera, mask in hair.items():
-        for name in lights[::6]:
+        for name in lights[1::4]:
             true = still.light(name, camera)[0][mask].astype(float)
             guess = three_nearest(capture, camera, still.rig.light(name), lights)[mask]
             off += float(np.square(capture.light(name, camera)[0][mask] - true).sum())
             left += float(np.square(guess - true).sum())
             size += float(np.square(true).sum())
     return {"pictures": (off / size) ** 0.5, "left-out light": (left / size) ** 0.5}
-
-
-def true_directions(subject: Subject, camera: Camera) -> tuple[Array, Array]:
-    """Angles `(H, W)` of the visible strands in the image, and where a pixel's are aligned."""
-    points, tangents = subject.strands.points[::STRIDE], subject.strands.tangents()[::STRIDE]
-    visible, x, y, depth = camera.pixels_of(points)
-    first = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(first, (y[visible], x[visible]), depth[visible])
-    visible &= depth < first[y, x] + 4e-3
-    ends = [camera.project(points[visible] + s * 1e-4 * tangents[visible])[0] for s in (-1, 1)]
-    way = (ends[1] - ends[0]) @ [1, 1j]
-    total, count = np.zeros(first.shape, complex), np.zeros(first.shape)
-    np.add.at(total, (y[visible], x[visible]), (way / np.abs(way)) ** 2)
-    np.add.at(count, (y[visible], x[visible]), 1)
-    return np.angle(total) / 2, np.abs(total) > ALIGNED * np.maximum(count, 3)
-
-
-def direction_errors(
-    capture: Capture, true: dict[str, tuple[Array, Array]], hair: dict[str, Array]
-) -> dict[str, float]:
-    """The median angle between directions in the single lights' images and the strands'."""
-    off = []
-    for camera, mask in hair.items():
-        images = [grey(capture.light(n, camera)[0]) for n in capture.olat_lights()]
-        angle, aligned = true[camera]
-        turn = orientations(np.stack(images), mask, BANK).angle - angle
-        off.append(np.abs((turn + np.pi / 2) % np.pi - np.pi / 2)[mask & aligned])
-    return {"directions °": float(np.degrees(np.median(np.concatenate(off))))}
 
 
 def strand_errors(capture: Capture, truth: StrandTruth, model: Path, seed: int) -> dict[str, float]:
@@ -248,7 +220,7 @@ def measure(
     cases[f"jump {JUMP[0] * 1e3:g} mm, {JUMP[1]:g}°"] = drift(*JUMP, seed, at)
     points = subject.strands.points[::50].astype(float)
     found: dict[str, Any] = {}
-    hair: dict[str, Array] = {}
+    hair: dict[str, Bools] = {}
     for k, (name, pose) in enumerate(cases.items()):
         progress(name, k / len(cases))
         capture = shoot(out / "captures" / str(k), subject, size, pose)
@@ -257,10 +229,8 @@ def measure(
             write_hair_masks(capture, out / "truth")
             for camera in capture.rig.cameras:
                 hair[camera.name] = np.asarray(capture.mask(camera.name))
-            true = {c.name: true_directions(subject, c) for c in capture.rig.cameras}
             truth = StrandTruth(still, out / "truth", samples=10_000) if strands else None
             found["still"] = picture_errors(still, still, hair)
-            found["still"] |= direction_errors(still, true, hair)
             if truth is not None:
                 found["still"] |= strand_errors(still, truth, out / "model", seed)
             save(out / f"{seed}.json", found)
@@ -277,14 +247,14 @@ def measure(
         }
         for row, (one, errors) in rows.items():
             found[row] = {**errors, **picture_errors(one, still, hair)}
-            found[row] |= direction_errors(one, true, hair)
             if truth is not None:
                 found[row] |= strand_errors(one, truth, out / "model", seed)
             save(out / f"{seed}.json", found)
     return found
 
 
-COLUMNS = ("motion mm", "motion °", "error_mm", "pictures", "left-out light", "directions °", "F")
+LIT = ("lit_difference_as_shot", "lit_difference_stabilised")
+COLUMNS = ("motion mm", "motion °", "error_mm", *LIT, "pictures", "left-out light", "F")
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
