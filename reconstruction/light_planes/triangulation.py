@@ -242,8 +242,11 @@ def support(points: Array, radius: float, neighbours: int = 32) -> Array:
     if not len(points):
         return np.zeros(0)
     k = min(neighbours, len(points) - 1) + 1
-    distance = cKDTree(points).query(points, k=k)[0].reshape(len(points), k)
-    score = np.exp(-0.5 * (distance / radius) ** 2).sum(axis=1)
+    tree, score = cKDTree(points), np.empty(len(points))
+    for first in range(0, len(points), CHUNK):
+        part = slice(first, first + CHUNK)
+        distance = tree.query(points[part], k=np.arange(1, k + 1))[0]
+        score[part] = np.exp(-0.5 * (distance / radius) ** 2).sum(axis=1)
     return np.asarray(score / (score + np.median(score)))
 
 
