@@ -102,13 +102,13 @@ def test_no_lamp_takes_another_pattern_s_level(bench, kind, monkeypatch):
     """While the levels of a pattern are written, all lamps are off."""
     one = bench(kind)
     one.driver.all_on()
-    seen = []
+    lit = []
     dim = one.lamps.dim
     monkeypatch.setattr(
-        one.lamps, "dim", lambda *words: (seen.append(one.lamps.power().any()), dim(*words))
+        one.lamps, "dim", lambda *words: (lit.append(one.lamps.power().any()), dim(*words))
     )
     one.driver.show(GRADED)
-    assert seen == [False, False]  # 122 levels, then the rest
+    assert lit == [False, False]  # 122 levels, then the rest
 
 
 def test_lamps_that_are_not_there_are_refused(any_bank):
