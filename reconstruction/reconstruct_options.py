@@ -40,10 +40,11 @@ class MeasureOptions:
 
     The filter `bank` is applied to images under groups of neighbouring lights; `texture_scale` in
     pixels is that of their local mean. Points closer than `thin` are merged first (None: 1.25
-    pixels). Points up to `tolerance` behind a camera's depth are visible in it (None: 5/3 pixels).
-    Scores of a point's directions are averaged over up to `neighbours` within `radius`; those of
-    reflections under single lights count `reflection_weight` times those of the texture. None: the
-    radius and weight by which half of the cameras predicts the other half best.
+    pixels, or as far as 250,000 points are apart). Points up to `tolerance` behind a camera's depth
+    are visible in it (None: 5/3 pixels). Scores of a point's directions are averaged over up to
+    `neighbours` within `radius`; those of reflections under single lights count `reflection_weight`
+    times those of the texture. None: the radius and weight by which half of the cameras predicts
+    the other half best.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=4.0, count=24, spread=1.5)
