@@ -97,6 +97,7 @@ class Decoder:
         self.given, self.maps = Lane(1, 4, GIVEN), Lane(1, 4, GIVEN)
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
+        self._starting: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._closed = False
 
@@ -118,9 +119,14 @@ class Decoder:
 
     def close(self) -> None:
         """End the process at once."""
-        with self._lock:
-            self._closed = True
+        self._closed = True
+        while not self._lock.acquire(timeout=0.05):
+            if (process := self._starting) is not None:
+                process.kill()  # it is loading libraries, and holds the lock until it is ready
+        try:
             self._end()
+        finally:
+            self._lock.release()
 
     def preview(self, file: Path, **look: Any) -> bytes:
         """A PNG of a frame, as `png_of_frame` makes it with `look`."""
@@ -259,9 +265,13 @@ class Decoder:
                     start_new_session=True,
                 ),
             )
+        self._starting = self._process
         ours.settimeout(START_S)
-        if not ours.recv(16):
-            raise ConnectionError("its process ended before it was ready")
+        try:
+            if not ours.recv(16):
+                raise ConnectionError("its process ended before it was ready")
+        finally:
+            self._starting = None
         return ours
 
     def _end(self) -> None:

@@ -307,7 +307,7 @@ def test_a_capture_that_was_aborted_is_continued_where_it_stopped(http, world):
         (lambda r: {"rig": replace(r.rig, lights=r.rig.lights[::-1])}, "the rig has changed"),
         (
             lambda r: {"capture": r.capture.model_copy(update={"tracking_every": 3})},
-            "the plan's steps",
+            "and with it the steps",
         ),
         (lambda r: {"safety": SafetyLimits(max_lamps=3)}, "max_lamps allows 3"),
     ],

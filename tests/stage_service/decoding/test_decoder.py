@@ -53,6 +53,24 @@ def forks(parent: int) -> list[int]:
     return [int(word) for word in path.read_text().split()]
 
 
+def test_a_process_that_is_still_starting_is_ended_at_once(monkeypatch, tmp_path):
+    """On a busy machine it loads its libraries for longer than a service may take to stop."""
+    slow = tmp_path / "python"
+    slow.write_text("#!/bin/sh\nexec sleep 100\n")
+    slow.chmod(0o755)
+    monkeypatch.setattr(side.sys, "executable", str(slow))
+    decoder = Decoder()
+    decoder.warm_up()
+    process = until(lambda: decoder._starting)
+    closing_it = threading.Thread(target=decoder.close)
+    closing_it.start()
+    closing_it.join(30)
+    assert not closing_it.is_alive()
+    assert gone(process.pid)
+    with pytest.raises(DecoderBusy, match="stopping"):
+        decoder.start()
+
+
 @pytest.mark.parametrize(
     ("data", "kind", "size"),
     [
