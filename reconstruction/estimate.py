@@ -302,20 +302,20 @@ class _Probe:
             add("line stereo", table=2e-5 * lines, gb=5e-7 * hair if fine else 0.0)
             out.insert(place, out.pop())
         else:
-            add("surface", table=2.8e-9 * n * n if sweep else 0.0, gb=8e-6 * n if sweep else 0.0)
+            add("surface", table=1.2e-4 * n if sweep else 0.0, gb=2e-6 * n if sweep else 0.0)
             if method == "fused":
                 found, lines = self._line_stereo(add, method)
         grown = (3.0 if bare else 1.2) * volume + 7e-6 * n + 5e-6 * lines
         if sweep:
-            grown = 0.6 + 2e-5 * n
+            grown = 0.6 + 5e-6 * n
         traced = (30 if bare else 16) * volume + (6e-5 if sweep else 1.2e-4) * n + 1e-4 * lines
         add("field", table=7.5 * volume + 2e-6 * (n + found), gb=1.2 * volume)
         add("strands", table=traced, gb=grown)
         if bare:
             return out
         if sweep:
-            add("refinement", table=2.0 + 3.3e-4 * n, gb=0.3 + 4e-5 * n)
-            add("roots", table=0.5 + 1.5e-5 * n, gb=0.2 + 2e-5 * n)
+            add("refinement", table=2.0 + 3.3e-4 * n, gb=0.3 + 6e-6 * n)
+            add("roots", table=0.5 + 1.5e-5 * n, gb=0.2 + 5e-6 * n)
         else:
             add("refinement")
             add("roots", table=1.5 + 3.3e-5 * n + 1.2e-4 * lines, gb=0.8 * grown)
