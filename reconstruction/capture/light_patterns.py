@@ -185,8 +185,8 @@ def read_table(path: Path) -> Table:
     try:
         return readers[path.suffix.lower()](path)
     except (OSError, ValueError, TypeError) as error:
-        text = str(error).removeprefix(f"{path}: ")
-        raise PatternError(f"{path}: {text}") from error
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        raise PatternError(f"{path}: {str(text).removeprefix(f'{path}: ')}") from error
 
 
 def _csv(path: Path) -> Table:

@@ -83,7 +83,8 @@ def _plan_of(args: argparse.Namespace) -> dict[str, Any]:
     try:
         rows = read_table(Path(args.patterns)).items()
     except PatternError as error:
-        raise BadArgument(f"--patterns: {error}") from error
+        also = "give s_matrix, gradients, or a table (.csv, .json)"
+        raise BadArgument(f"--patterns: {error}: {also}") from error
     # what is off is left out: a request has few values
     return plan | {"patterns": {n: {x: w for x, w in row.items() if w} for n, row in rows}}
 
