@@ -62,9 +62,11 @@ def looks(capture: Capture, camera: str, subject: Bools, lights: int = 96) -> Ar
     known = np.empty(values.shape, bool)
     colour, noise = np.zeros((len(values), 3)), 0.0
     for k, name in enumerate(names):
-        intensity = capture.rig.light(name).intensity_towards(np.zeros(3)).mean()
+        light = capture.rig.light(name)
+        # a light that is nearer than the others would count as gloss
+        square = float((light.position**2).sum())
         image, saturated = capture.light(name, camera)
-        image = image / np.float32(intensity)
+        image = image * np.float32(square / light.intensity_towards(np.zeros(3)).mean())
         colour += np.where(saturated[subject][:, None], 0, image[subject])
         known[:, k] = ~ndimage.maximum_filter(saturated & subject, 3)[subject]
         mean = grey(image)
