@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,9 @@ from reconstruction import Camera, Capture, CaptureWriter, Light, Mesh, Rig, Ste
 from reconstruction.geometry.lights import dome_positions
 from reconstruction.geometry.mesh_queries import mesh_depth
 from reconstruction.images.hair_features import (
+    FAINTEST_GLOSS,
     clear_classes,
+    looks,
     matte_fit,
     two_classes,
 )
@@ -225,6 +229,35 @@ def test_gloss_is_that_of_the_true_signal_at_any_noise(noise: float) -> None:
     assert gloss(matte) < 0.05
     assert gloss(hidden) < 0.05
     assert gloss(fibres) > 0.12
+
+
+def test_a_light_that_is_nearer_than_the_others_is_no_gloss() -> None:
+    """A matte wall under Lambert's law and the inverse square; one light in eight is at 0.7."""
+    rng = np.random.default_rng(4)
+    distance = np.where(np.arange(48) % 8 == 0, 0.84, 1.2)
+    lights = {
+        f"l{i}": Light(f"l{i}", r * p, np.full(3, 8.0))
+        for i, (r, p) in enumerate(zip(distance, dome(48), strict=True))
+    }
+    normals = facing(rng, 400)
+
+    def frame(name: str, _camera: str) -> tuple[np.ndarray, np.ndarray]:
+        away = lights[name].position
+        light = 8.0 * np.maximum(normals @ away, 0) / np.linalg.norm(away) ** 3
+        image = np.repeat(0.4 * light, 9)[:, None, None] * np.ones(3)
+        return image.reshape(400, 9, 3).astype(np.float32), np.zeros((400, 9), bool)
+
+    capture: Any = SimpleNamespace(
+        olat_lights=lambda: list(lights),
+        has_light=lambda *_: True,
+        rig=SimpleNamespace(light=lights.__getitem__),
+        light=frame,
+    )
+    subject = np.zeros((400, 9), bool)
+    subject[1::3, 4] = True  # of rows whose neighbours are left out
+    found = looks(capture, "c", subject)
+    assert found is not None
+    assert np.quantile(found[0], 0.95) < FAINTEST_GLOSS
 
 
 def crown(cameras: tuple[Camera, ...], names: tuple[str, ...]) -> PointCloud:

@@ -407,7 +407,13 @@ def rig_file(world: World, wire: Callable[..., Wires]) -> Iterator[RigFile]:
 
 
 def devices(
-    ports: list[int], paths: list[str], slack: int, lights: float = 0.8, trigger: float = 0.3
+    ports: list[int],
+    paths: list[str],
+    slack: int,
+    lights: float = 0.8,
+    trigger: float = 1.0,
+    projectors: float = 1.0,
+    cameras: float = 1.0,
 ) -> str:
     return f"""
 [safety]
@@ -423,10 +429,10 @@ port = "{paths[0]}"
 timeout_s = {trigger * slack:g}
 [devices.projectors]
 port = "{paths[1]}"
-timeout_s = {0.3 * slack:g}
+timeout_s = {projectors * slack:g}
 [devices.cameras]
 port = {ports[1]}
-timeout_s = {0.3 * slack:g}
+timeout_s = {cameras * slack:g}
 busy_s = 30.0
 [capture.exposure]
 dark = 0.002

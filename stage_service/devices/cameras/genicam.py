@@ -259,7 +259,7 @@ class GenicamCamera(ABC):
             if self._camera is not None and self._removed():
                 raise self._gone(doing) from error
             todo = "Check power and cable, and that no other program holds the camera."
-            expected = f"{self.library} to carry it out"
+            expected = f"success of {self.library}"
             raise self._error(doing, expected, str(error), todo) from error
 
     def _gone(self, doing: str) -> DeviceUnreachable:

@@ -376,7 +376,7 @@ class Gphoto2Camera:
                 raise self._full(doing) from error
             todo = "Check lens (manual focus), mode dial (M), mirror lock-up, card and cable."
             received = f"{error} ({self._condition() if self._camera else 'closed'})"
-            raise self._error(doing, "libgphoto2 to carry it out", received, todo) from error
+            raise self._error(doing, "success of libgphoto2", received, todo) from error
         finally:
             self._lock.release()
 

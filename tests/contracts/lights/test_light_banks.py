@@ -83,7 +83,7 @@ def test_levels_of_several_lamps_are_as_commanded(bench, kind):
     one.driver.show(GRADED)
     np.testing.assert_allclose(one.powers(), GRADED, atol=0.5 / 255)
     assert one.lit() == list(range(1, 200))
-    one.driver.set_level(0.25)  # as before, but no lamp has it any more
+    one.driver.set_level(0.25)  # the level of the call above, which no lamp has after `show`
     np.testing.assert_allclose([one.powers()[i] for i in one.lit()], 0.25, atol=0.5 / 255)
     one.driver.all_on()
     np.testing.assert_allclose(one.powers(), 0.25, atol=0.5 / 255)

@@ -87,7 +87,8 @@ def test_a_capture_for_which_no_thread_can_be_had_keeps_nobody_from_anything(
     assert status.outcome == "interrupted"
     monkeypatch.undo()
     manager.resume(status.id)
-    assert manager.wait(status.id, 20).outcome == "completed"
+    ended = manager.wait(status.id, 20)
+    assert ended.outcome == "completed", ended.error
 
 
 PATTERNS = CapturePlan(
