@@ -16,7 +16,7 @@ from appearance.scene.backend import BackendError, ensure_backend
 from reconstruction.geometry.rig import RigError
 from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.render_process import RenderPool
-from simulators.frames.responses import Quality, Responder, reproducible
+from simulators.frames.responses import Quality, Responder, check_memory, reproducible
 from simulators.frames.work import MeasuredResponder
 from simulators.peers.devices import SimulatedStage
 from simulators.peers.faults import Faults
@@ -56,6 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
         if args.truth_only is not None:
             write_truth(args.truth_only, subject, drift)
             return 0
+        if isinstance(subject, Subject):
+            check_memory(rig_file.rig, subject, args.processes)
         if args.truth is not None:
             write_truth(args.truth, subject, drift)
     except (ValueError, RigError, OSError) as error:

@@ -14,8 +14,10 @@ from appearance.inverse_rendering.problem import direct_spp
 
 _KERNELS = 50_000_000
 """Kernels, of any scene: 25 to 75 MB, less where they need not be compiled."""
+_SCENE_BYTES = 150
+"""Of a strand's point in the scene: its spline and the acceleration structure."""
 _POINT_BYTES, _BUILDING_BYTES = 225, 375
-"""Of a strand's point in the scene, and at most while that is built."""
+"""The same with its coordinates on the hair, and at most while those are computed."""
 _FRAME_BYTES = 25
 """Of a captured pixel under a light."""
 _WHOLE_BYTES, _GUESS_BYTES = 72, 120
@@ -38,12 +40,22 @@ class Sizes:
     points: int = 0
 
 
+def scene_memory(points: int, beside: float = 0.0, *, mapped: bool = True) -> float:
+    """GB of the scene of so many points of strands, its kernels, and `beside` that are used then.
+
+    `mapped`: with coordinates on the hair.
+    """
+    if not mapped:
+        return (_KERNELS + points * _SCENE_BYTES) / 1e9 + beside
+    whole = (_KERNELS + points * _POINT_BYTES) / 1e9 + beside
+    return max(points * _BUILDING_BYTES / 1e9, whole)
+
+
 def memory_needed(sizes: Sizes, options: InverseRenderingOptions) -> float:
     """GB that a fit takes, scene and kernels too, beside what the program holds before, about."""
     pixels, largest, lights = sum(sizes.views), max(sizes.views, default=0), sizes.lights
     whole = largest * lights * (_WHOLE_BYTES + 2 * _GUESS_BYTES)
     kept = min(largest, options.effort.pixels) * max(FEWEST, 2 * options.effort.spp)
     turns = pixels * lights * (_TURN_BYTES + direct_spp(pixels) * _LIT_BYTES)
-    fitting = _KERNELS + sizes.points * _POINT_BYTES + pixels * lights * _FRAME_BYTES
-    fitting += max(whole, kept * _PATH_BYTES, turns)
-    return max(sizes.points * _BUILDING_BYTES, fitting) / 1e9
+    fitting = pixels * lights * _FRAME_BYTES + max(whole, kept * _PATH_BYTES, turns)
+    return scene_memory(sizes.points, fitting / 1e9)

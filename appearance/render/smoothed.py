@@ -17,10 +17,16 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from appearance.render.coverage import coverage
 from appearance.render.environment import direct_environment, indirect_environment
 from appearance.render.harmonics import projected
-from appearance.render.olat import render_direct, render_indirect, spread_out
+from appearance.render.olat import (
+    FILM_BYTES,
+    OlatOptions,
+    render_direct,
+    render_indirect,
+    spread_out,
+)
 from appearance.render.paths import Surface, pixel_indices
 from appearance.render.pixel_field import field_of
-from appearance.render.tracing import Sampling
+from appearance.render.tracing import LANE_BYTES, Sampling
 from appearance.scene.hair_scene import HairScene
 from reconstruction import Camera, Light
 from reconstruction.arrays import AnyFloats, Floats, Ints
@@ -79,6 +85,17 @@ def olat_smoothed(
     if field is not None:
         out = field.lit(out, lights)
     return out if pixels is not None else spread_out(out, wanted, camera)
+
+
+def memory_needed(camera: Camera, pixels: int, lights: int) -> float:
+    """Approximate GB that `olat_smoothed` takes where `pixels` show the subject, beside the scene.
+
+    Three arrays of radiance, and the larger of a tile of paths and of the blurred full images.
+    """
+    radiance = 12 * lights * pixels
+    tile = min(pixels * (FILM_BYTES * lights + LANE_BYTES), OlatOptions().memory)
+    blurred = 12 * min(lights, _AT_A_TIME) * (2 * camera.width * camera.height + 7 * pixels)
+    return (2 * radiance + max(tile, blurred, radiance)) / 1e9
 
 
 def environment_smoothed(

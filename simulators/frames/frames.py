@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -69,10 +70,10 @@ class Snapshot:
 class FrameMaker:
     """Makes counts of snapshots, with a cache of responses.
 
-    At pose 0 the response of each light is cached, and frames are weighted sums; at other poses,
-    where only closing frames have lights, one image per light vector is rendered. Sweeps are cached
-    for the last two poses of each camera. Threads may request frames of different cameras at the
-    same time.
+    At pose 0 the response of each light is cached, beyond `in_memory` bytes in temporary files, and
+    frames are weighted sums; at other poses, where only closing frames have lights, one image per
+    light vector is rendered. Sweeps are cached for the last two poses of each camera. Threads may
+    request frames of different cameras at the same time.
     """
 
     def __init__(
@@ -81,7 +82,9 @@ class FrameMaker:
         responder: Responder,
         sensor: Sensor,
         seed: int,
+        in_memory: int = 1 << 30,
     ) -> None:
+        self._in_memory = in_memory
         self._rig, self._responder, self._sensor = rig, responder, sensor
         self._seed = seed
         self._lights: dict[str, Response] = {}
@@ -133,8 +136,19 @@ class FrameMaker:
 
     def _all_lights(self, camera: str) -> Response:
         if camera not in self._lights:
-            self._lights[camera] = self._responder.lights(camera)
+            response = self._responder.lights(camera)
+            held = sum(x.images.nbytes for x in list(self._lights.values()))
+            if held + response.images.nbytes > self._in_memory:
+                response = replace(response, images=_on_disk(response.images))
+            self._lights[camera] = response
         return self._lights[camera]
+
+
+def _on_disk(images: NDArray[Any]) -> NDArray[Any]:
+    """A copy in a temporary file, mapped into memory."""
+    with TemporaryFile() as file:
+        images.tofile(file)
+        return np.memmap(file, images.dtype, "r", shape=images.shape)
 
 
 def _cached(store: OrderedDict[Any, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:

@@ -7,17 +7,23 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from appearance.scene.backend import ensure_backend
 from reconstruction import Camera, Rig
 from reconstruction.arrays import Array, Floats, Ints
+from reconstruction.report.report import free_memory
 from simulators.subject.drift import Drift
 from simulators.subject.subject import Subject
 
 if TYPE_CHECKING:
     from appearance import HairScene
+
+
+PROCESS_GB = 0.45
+"""Of Python, Mitsuba and LLVM."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,33 @@ def reproducible(
     """
     ensure_backend(threads=1)
     return MitsubaResponder(rig, subject, drift, quality, seed)
+
+
+def frames_memory(rig: Rig, subject: Subject) -> float:
+    """Approximate GB of a process that renders cameras of `rig` under each of its lights."""
+    from appearance.inverse_rendering.memory import scene_memory
+    from appearance.render.smoothed import memory_needed
+
+    points, images = subject.strands.points, [0.0]
+    for camera in rig.cameras:
+        pixel, depth = camera.project(points)
+        shown = pixel[(depth > 0) & camera.inside(pixel)].astype(np.float32)
+        area = cv2.contourArea(cv2.convexHull(shown)) if len(shown) else 0.0
+        images.append(memory_needed(camera, round(area), len(rig.lights)))
+    mapped = subject.absorption is not None
+    return PROCESS_GB + scene_memory(len(points), max(images), mapped=mapped)
+
+
+def check_memory(rig: Rig, subject: Subject, processes: int) -> None:
+    """Raise `ValueError` if so many rendering processes need more memory than is free."""
+    count, free = min(processes, len(rig.cameras)), free_memory()
+    needed = count * frames_memory(rig, subject)
+    if free is not None and needed > free:
+        raise ValueError(
+            f"frames of {len(rig.lights)} lights take about {needed:.1f} GB of memory in {count} "
+            f"rendering processes, and {free:.1f} GB are free: use fewer --processes, strands or "
+            "lights, or smaller cameras"
+        )
 
 
 class MitsubaResponder:

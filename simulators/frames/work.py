@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, NamedTuple
 
-from reconstruction import Rig
+from reconstruction import Camera, Rig
 from reconstruction.arrays import Array
 from simulators.frames.responses import Quality, Responder, Response
 
@@ -26,13 +26,25 @@ class Cost(NamedTuple):
 
 
 COSTS = {
-    "lights": Cost(2.5, 0.8e-5, 6e-7, 6.0),
+    "lights": Cost(2.5, 1e-6, 6e-7, 6.0),
     "lights_together": Cost(0.3, 2e-6, 0.0, 1.0),
     "sweep": Cost(0.2, 6e-6, 0.0, 1.0),
 }
 """The prediction until calls are measured."""
 OVERDUE = 1.1
 """A call that takes longer than predicted is expected to take this multiple of its time so far."""
+
+
+def predicted_seconds(what: str, camera: Camera, lights: int, quality: Quality) -> float:
+    """Seconds of a call (a name of `COSTS`) for a camera of a rig with so many `lights`."""
+    cost = COSTS[what]
+    paths = {
+        "lights": quality.lights,
+        "lights_together": quality.together,
+        "sweep": quality.sweep,
+    }
+    pixels = camera.width * camera.height
+    return cost.call + pixels * paths[what] * (cost.path + cost.light * lights)
 
 
 @dataclass
@@ -68,15 +80,9 @@ class MeasuredResponder:
         self._names = [c.name for c in rig.cameras]
         self._lanes = [_Lane(self._names[i::lanes]) for i in range(min(lanes, len(self._names)))]
         self._lane = {name: lane for lane in self._lanes for name in lane.cameras}
-        paths = {
-            "lights": quality.lights,
-            "lights_together": quality.together,
-            "sweep": quality.sweep,
-        }
         self._predicted = {
-            (what, c.name): cost.call
-            + c.width * c.height * paths[what] * (cost.path + cost.light * len(rig.lights))
-            for what, cost in COSTS.items()
+            (what, c.name): predicted_seconds(what, c, len(rig.lights), quality)
+            for what in COSTS
             for c in rig.cameras
         }
         self._lock = threading.Lock()

@@ -87,3 +87,14 @@ def test_an_unknown_variant_is_reported_before_devices_are_ready(
     said = capsys.readouterr()
     assert said.err.startswith("simulators: there is no variant 'nonsense'")
     assert said.out == "", "nobody is told that it is ready"
+
+
+def test_a_rig_whose_frames_need_more_memory_than_is_free_is_refused(
+    rig_file, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("simulators.frames.responses.free_memory", lambda: 0.2)
+    words = ["--rig", rig_file, "--state", tmp_path / "state", *small_subject(tmp_path)]
+    assert main([str(w) for w in words]) == 2
+    error = capsys.readouterr().err
+    assert "of 1 lights take about 0.5 GB of memory in 1 rendering processes, and 0.2 GB" in error
+    assert "use fewer --processes" in error

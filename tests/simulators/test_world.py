@@ -135,6 +135,14 @@ def test_responses_are_rendered_once_and_old_poses_go(frames):
     ]
 
 
+def test_frames_of_responses_on_disk_are_those_of_responses_in_memory(tiny_rig, frames):
+    on_disk = FrameMaker(tiny_rig, Counting(), Sensor(), 0, in_memory=0)
+    for power in ((1, 0, 0, 0, 0.5), (1,) * 5):
+        same = [x.radiance("cam_a", shot(power)) for x in (frames, on_disk)]
+        assert np.array_equal(*same)
+    assert isinstance(on_disk._lights["cam_a"].images, np.memmap)
+
+
 def test_drift_starts_at_rest_and_reaches_the_requested_value():
     drift = Drift(18, 1.5e-3, 4)
     rotation, translation = drift.pose(0)
