@@ -10,25 +10,42 @@ import numpy as np
 
 from appearance.fields.options import FieldRequest
 from appearance.fields.pipeline import memory_needed as field_memory
+from appearance.inverse_rendering.lobes import without_axis
 from appearance.inverse_rendering.loop import SHARED_LIGHTS, SHARED_VIEWS
-from appearance.inverse_rendering.memory import Sizes, memory_needed
+from appearance.inverse_rendering.memory import Sizes, memory_needed, scene_memory
 from appearance.inverse_rendering.options import InverseRenderingRequest
+from appearance.inverse_rendering.problem import direct_spp
 from appearance.metrics.decision import FitStage
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
+from appearance.render.coverage import pixel_coverage
 from appearance.render.olat import render_olat
+from appearance.render.smoothed import memory_needed as frames_memory
+from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model
 from reconstruction.geometry.lights import components
 from reconstruction.report.report import resident_memory
 
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
-_PATHS = {"sun": 2.7e6, "shared": 87.0, "spatial": 6e5, "correctives": 1.1e6}
-"""Paths of the stages, in paths of the probe: of sun, spatial and correctives in all; of shared for
-each of a patch's."""
-_FIELD_DIRECT, _FIELD_LIGHT = 30.0, 2.3
-"""Of a field, a pixel's paths beside `spp`: of direct light, and for each light."""
+_PATHS = {"sun": 5e5, "shared": 87.0, "spatial": 6e5, "correctives": 2e5, "field": 5e5}
+"""Paths of the stages whatever the size, in paths of the probe; of shared for each of a patch's."""
+_SUN_PATH, _TURN_PATH, _CALL = 19.0, 3.0, 1800.0
+"""Further ones: of sun for each colour path of an observed pixel, of correctives for each cached
+path and light, and of each rendering of a view."""
+_SUN_CALLS, _CELL_CALLS = 9, 18
+"""Renderings of each view by sun, and by spatial."""
+_LIBRARIES_GB = 0.15
+"""Of LLVM, which the first rendering loads."""
+_SUN_BYTES = 100
+"""Of a pixel under a light: copies of frames, and three renderings at once."""
+_FIELD_DIRECT, _FIELD_INDIRECT = 1.2, 0.044
+"""Of a field, for each light of a pixel: direct light, and each of its paths of indirect light."""
+_LOBES = 1.4e6
+"""Further paths of lights without an axis, if none is determined."""
 _JUDGED = 1 << 20
 """Paths of the held-out frames of a guess."""
+_SAMPLES = 10_000
+"""Pixels of an image for the share of it that shows the subject."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +63,7 @@ def estimate_fit(
     *,
     held_out: HeldOut,
     stages: Sequence[FitStage],
+    sun: FitOptions,
     request: InverseRenderingRequest,
     field: FieldRequest,
 ) -> list[StageCost]:
@@ -53,35 +71,49 @@ def estimate_fit(
 
     Raises `ModelError` or `CaptureError` for what is missing.
     """
+    base = (resident_memory() or 0.0) + _LIBRARIES_GB
     training = held_out.training(capture)
     hair = [int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras]
     lightings = [training.lighting(name) for name in training.lightings()]
-    lights, strands = len(lightings), model.strands()
-    path, base = _seconds_a_path(training, model), resident_memory() or 0.0
+    lights, views, strands = len(lightings), len(hair), model.strands()
+    path, share = _seconds_a_path(training, model)
+    shown = [round(share * c.width * c.height) for c in training.rig.cameras]
     effort = request.fit.effort
-    pixels = [min(n, request.hair_pixels) for n in hair]
+    pixels, observed = ([min(n, x) for n in hair] for x in (request.hair_pixels, sun.hair_pixels))
     fitted = len(components(lightings[: request.lights + request.validation_lights])[0])
-    views = min(SHARED_VIEWS, len(pixels)) * min(SHARED_LIGHTS, fitted)
+    of_patches = min(SHARED_VIEWS, views) * min(SHARED_LIGHTS, fitted)
     judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
-    shared = _PATHS["shared"] * views * effort.pixels * effort.spp / SHARED_LIGHTS + judged
-    most_lights, most = field.resolved(len(hair), len(strands))
+    shared = _PATHS["shared"] * of_patches * effort.pixels * effort.spp / SHARED_LIGHTS + judged
+    cached = sum(pixels) * direct_spp(sum(pixels)) * min(fitted, request.lights)
+    most_lights, most = field.resolved(views, len(strands))
     of_field, many = [min(n, most) for n in hair], min(lights, most_lights)
     paths = {
-        "sun": _PATHS["sun"],
+        "sun": _PATHS["sun"]
+        + _SUN_PATH * sun.colour_spp * sum(observed)
+        + _CALL * _SUN_CALLS * views,
         "shared": shared,
-        "spatial": _PATHS["spatial"] + shared,
-        "correctives": _PATHS["correctives"] + judged,
-        "lights": shared,
-        # every pixel of hair is rendered, for what is smooth
-        "field": sum(hair) * (field.spp + _FIELD_DIRECT + _FIELD_LIGHT * many),
+        "spatial": _PATHS["spatial"] + _CALL * _CELL_CALLS * views + shared,
+        "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
+        "lights": shared + (_LOBES if any(map(without_axis, lightings)) else 0),
+        # every pixel of the subject is rendered, for what is smooth
+        "field": _PATHS["field"]
+        + sum(shown) * many * (_FIELD_DIRECT + _FIELD_INDIRECT * field.spp),
     }
-    material = memory_needed(Sizes(pixels, fitted, len(strands.points)), request.fit)
-    memory = {"field": field_memory(of_field, many, len(strands), field)}
+    points = len(strands.points)
+    frames = max(map(frames_memory, training.rig.cameras, shown, [many] * len(shown)))
+    memory = {
+        "sun": scene_memory(points, 1e-9 * _SUN_BYTES * lights * sum(observed), mapped=False),
+        "field": scene_memory(
+            points, max(frames, field_memory(of_field, many, len(strands), field))
+        ),
+    }
+    material = memory_needed(Sizes(pixels, fitted, points), request.fit)
     return [StageCost(x, path * paths[x], base + memory.get(x, material)) for x in stages]
 
 
-def _seconds_a_path(training: Capture, model: Model) -> float:
-    """Of a path under four lights, with brown hair, in the middle camera."""
+def _seconds_a_path(training: Capture, model: Model) -> tuple[float, float]:
+    """Of a path under four lights, with brown hair, in the middle camera; and the share of its
+    image that shows the subject."""
     scene = FittedModel.unfitted(model, training).scene()
     cameras = training.rig.cameras
     camera = cameras[len(cameras) // 2]
@@ -89,8 +121,11 @@ def _seconds_a_path(training: Capture, model: Model) -> float:
     pixels = hair[:: -(-max(len(hair), 1) // _PROBE_PIXELS)]
     lights = [training.lighting(name) for name in training.lightings()][:_PROBE_LIGHTS]
     seconds = []
-    for seed in range(2):  # kernels are compiled in the first
+    for seed in range(4):  # kernels are compiled in the first
         begun = time.perf_counter()
         render_olat(scene, camera, lights, pixels=pixels, spp=_PROBE_SPP, seed=seed)
         seconds.append(time.perf_counter() - begun)
-    return seconds[-1] / max(len(pixels) * _PROBE_SPP, 1)
+    some = np.linspace(0, camera.width * camera.height - 1, _SAMPLES).astype(np.int64)
+    covered = pixel_coverage(scene, camera, some)
+    share = float((covered["hair"] + covered["head"] > 0).mean())
+    return min(seconds[1:]) / max(len(pixels) * _PROBE_SPP, 1), share

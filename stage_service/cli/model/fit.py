@@ -129,6 +129,7 @@ def _estimate(capture: Capture, model: Model, options: JobOptions, output: Outpu
         model,
         held_out=HeldOut(options.held_out_cameras, options.held_out_lights),
         stages=options.stages,
+        sun=options.fit,
         request=options.inverse_rendering,
         field=options.fields,
     )
