@@ -19,6 +19,7 @@ BENCHMARKS = {
     "backends": "BSDF, OLAT, inverse rendering and line stereo on CPU and GPU: seconds, agreement",
     "bsdf": "our hair BSDF compared with Mitsuba's: tables and images",
     "callers": "load x caller x fault: seconds to a blackout, how much slower a capture is",
+    "cost": "frames and fits by size: seconds and memory compared with the estimates",
     "demo": "recorded demos over subjects and seeds compared with their baselines",
     "error_parts": "a demo's error on held-out frames, part by part replaced by the truth",
     "exports": "a model opened, rendered and written by Blender, compared with ours",

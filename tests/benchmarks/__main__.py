@@ -26,6 +26,7 @@ MODULES = {
     "backends": "benchmarks.backends.side_by_side",
     "bsdf": "benchmarks.bsdf.mitsuba_comparison",
     "callers": "benchmarks.service.callers",
+    "cost": "benchmarks.renderers.cost",
     "demo": "benchmarks.demo",
     "error_parts": "benchmarks.appearance.error_parts",
     "exports": "benchmarks.exports.blender",

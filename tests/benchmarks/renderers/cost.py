@@ -1,24 +1,37 @@
-"""What a path costs over strands, bounces, pixels and lights, and beside bare rays."""
+"""Cost against size: CPU seconds and memory of frames and fits, compared with their estimates.
+
+Each job is a process of its own, on one core, whose clock counts CPU seconds, so that other work
+on the machine does not count. Leaves `cost.json` and `cost.md`.
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from appearance import HairScene, render_olat
+from appearance import HairScene
 from appearance.render.coverage import coverage
-from appearance.render.paths import Surface, stream, wave
-from benchmarks.results import Panel
+from benchmarks.command import Benchmark
+from benchmarks.results import markdown, save
 from benchmarks.subjects import Subject
-from reconstruction import Camera, Light, Strands
-from reconstruction.array_backend import for_kernels
+from reconstruction import Camera, CaptureWriter, Light, Model, Progress, Rig, Step, Strands
 from reconstruction.arrays import Ints
+from reconstruction.geometry.lights import dome_positions
+from simulators.frames.responses import MitsubaResponder, Quality, frames_memory, reproducible
+from simulators.frames.work import predicted_seconds
+from simulators.subject.drift import Drift
+from simulators.subject.subject import Subject as Simulated
+from simulators.subject.subject import make_subject
 
 
 @dataclass(frozen=True)
@@ -30,10 +43,6 @@ class Effort:
     spp: Sequence[int] = (4, 16, 48)
     path_spp: Sequence[int] = (4, 8)
     reference_spp: int = 128
-    strands: Sequence[int] = (1_000, 10_000, 100_000)
-    bounces: Sequence[int] = (1, 2, 4, 8, 16, 32)
-    growth_pixels: Sequence[int] = (200, 800, 3200)
-    growth_spp: int = 32
 
 
 @dataclass(frozen=True)
@@ -62,51 +71,6 @@ def hair_pixels(
     return np.sort(np.random.default_rng(seed).permutation(covered)[:count])
 
 
-def growth(subject: Subject, view: View, lights: list[Light], effort: Effort) -> dict[str, Any]:
-    """Cost over strands, bounces and pixels, and beside the bare rays'."""
-    seed, spp = view.seed, effort.growth_spp
-
-    def cost(view: View, depth: int | None = None) -> dict[str, float]:
-        scene, index = view.scene, view.index
-        render_olat(scene, view.camera, lights, spp=spp, pixels=index, max_depth=depth)
-        start = time.process_time()
-        render_olat(scene, view.camera, lights, spp=spp, pixels=index, max_depth=depth, seed=seed)
-        seconds = time.process_time() - start
-        return {"cpu_seconds": seconds, "us_per_path": 1e6 * seconds / spp / len(index)}
-
-    found: dict[str, Any] = {"lights": len(lights), "strands": {}, "bounces": {}, "pixels": {}}
-    for count in effort.strands:
-        strands = with_count(subject.strands, count, seed)
-        other = View.of(replace(subject, strands=strands), view.camera, effort.pixels, seed)
-        bare, one = bare_rays(other), cost(other)
-        rays = one["us_per_path"] / bare["shadow_us"]
-        found["strands"][str(count)] = {**one, **bare, "path_in_shadow_rays": rays}
-    for depth in effort.bounces:
-        found["bounces"][str(depth)] = cost(view, depth)
-    for pixels in effort.growth_pixels:
-        part = replace(view, index=hair_pixels(view.scene, view.camera, pixels, seed))
-        found["pixels"][str(len(part.index))] = cost(part)
-    return found
-
-
-def growth_panels(result: dict[str, Any]) -> list[Panel]:
-    """CPU time of a path over strands, bounces and pixels, and over lights."""
-    found = result["growth"]
-    panels = []
-    for what in ("strands", "bounces", "pixels"):
-        points = [(int(n), p["us_per_path"]) for n, p in found[what].items()]
-        y = f"µs a path, {found['lights']} lights"
-        panels.append(Panel("", {"ours": points}, what, y, ("log", "linear")))
-    curves = {}
-    for name, subject in result["subjects"].items():
-        curves[name] = [
-            (int(count), 1e6 * p["cpu_seconds"] / p["spp"] / subject["pixels"])
-            for count, entry in subject["lights"].items()
-            for p in [q for q in entry["series"] if q["method"] == "ours"][-1:]
-        ]
-    return [*panels, Panel("", curves, "lights", "µs a path")]
-
-
 def with_count(strands: Strands, count: int, seed: int) -> Strands:
     """`count` of the strands, or copies of them a few millimetres aside, at the same coverage."""
     rng = np.random.default_rng(seed)
@@ -121,41 +85,180 @@ def with_count(strands: Strands, count: int, seed: int) -> Strands:
     return replace(moved, radius=radius)
 
 
-def bare_rays(view: View, rounds: int = 64) -> dict[str, float]:
-    """Microseconds of CPU a ray of the scene takes when nothing else is done.
+SPP = 4
+"""Paths a pixel of the frames that are fitted."""
 
-    From each pixel's first hit towards random directions: `closest_us` with the surface's answer
-    (`ray_intersect`), `shadow_us` (`occluded`).
-    """
-    scene, lanes = view.scene, len(view.index)
-    surface = Surface(scene)
-    pixel = mi.UInt32(for_kernels(view.index, np.uint32))
-    camera_paths = wave(view.camera, pixel, lanes, 0, 1, 1, view.seed)
-    start = surface.interact(camera_paths.rays, mi.Bool(True))
-    found = {}
-    for name in ("closest_us", "shadow_us"):
-        for _ in range(2):  # the first compiles
-            rng = stream(lanes, view.seed)
-            count = dr.zeros(mi.UInt32, lanes)
-            dr.eval(start, count)
-            begun = time.process_time()
 
-            def body(i: Any, count: Any, rng: Any, name: str = name) -> Any:
-                towards = mi.warp.square_to_uniform_sphere(
-                    mi.Point2f(rng.next_float32(), rng.next_float32())
-                )
-                ray = start.spawn_ray(towards)
-                if name == "shadow_us":
-                    hit = scene.occluded(ray)
-                else:
-                    hit = surface.interact(ray, mi.Bool(True)).t < 1
-                return i + 1, count + dr.select(hit, mi.UInt32(1), 0), rng
+@dataclass(frozen=True)
+class Size:
+    """Cameras of `side`² pixels, lights, strands, and most vertices of a path."""
 
-            _, count, _ = dr.while_loop(
-                (mi.UInt32(0), count, rng), lambda i, count, rng: i < rounds, body, label="rays"
+    side: int = 192
+    lights: int = 24
+    strands: int = 10_000
+    bounces: int = 16
+    cameras: int = 1
+
+    def rig(self) -> Rig:
+        """Cameras in an arc around the head's back and sides, and a dome of lights."""
+        angles = np.linspace(-0.7, 0.7, self.cameras) * np.pi if self.cameras > 1 else [0.0]
+        cameras = (
+            Camera.look_at(
+                f"cam_{k:02d}",
+                self.side,
+                self.side,
+                (0.95 * np.sin(a), -0.95 * np.cos(a), 0.1),
+                (0, 0, -0.03),
+                25.0,
             )
-            dr.eval(count)
-            dr.sync_thread()
-            seconds = time.process_time() - begun
-        found[name] = 1e6 * seconds / rounds / lanes
+            for k, a in enumerate(angles)
+        )
+        places = enumerate(dome_positions(self.lights, 1.2, -30.0))
+        lights = (Light(f"light_{i:03d}", p, np.full(3, 8.0)) for i, p in places)
+        return Rig("cost", tuple(cameras), tuple(lights), ())
+
+    def subject(self, seed: int) -> Simulated:
+        """The groom "wavy" at the same coverage."""
+        return make_subject("wavy", seed, self.strands)
+
+
+BASE = Size()
+AXES: dict[str, tuple[int, ...]] = {
+    "side": (96, 384),
+    "lights": (6, 96),
+    "strands": (50_000, 150_000),
+    "bounces": (1, 4),
+}
+FITS = {
+    Size(96, 16, 5_000, cameras=4): "sun,shared,spatial,correctives,lights,field",
+    Size(128, 24, 20_000, cameras=8): "sun,field",
+}
+"""Stages of fits: those of the second take longer with each camera."""
+QUICK = Size(64, 24, 1_000, 4, cameras=2)
+_LITTLE = {"fit": {"hair_pixels": 800, "iterations": 1, "error_paths": 1, "roughness_spp": 2}}
+
+
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Frames over each axis, then fits of two sizes; rows of estimated and measured figures."""
+    base, axes, fits, options = BASE, AXES, FITS, {}
+    if args.quick:
+        base, axes, fits, options = QUICK, {"strands": (2_000,)}, {QUICK: "sun"}, _LITTLE
+    frames = [base] + [replace(base, **{name: x}) for name, xs in axes.items() for x in xs]
+    rows: list[dict[str, Any]] = []
+    for k, size in enumerate([*frames, *fits]):
+        fit = k >= len(frames)
+        progress(f"{'fit' if fit else 'frames'}: {size}", k / (len(frames) + len(fits)))
+        rows += _fit(size, args.seed, fits[size], options) if fit else _frames(size, args.seed)
+        save(args.out / "cost.json", {"seed": args.seed, "rows": rows})
+    (args.out / "cost.md").write_text(_table(rows))
+    return {"seed": args.seed, "rows": rows}
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown: estimated over measured beside the measured figures."""
+    head = ["job", "cameras", "side", "lights", "strands", "bounces", "CPU s", "est. : measured"]
+
+    def cells(row: dict[str, Any]) -> list[object]:
+        size, found = row["size"], [row["job"]]
+        found += [size[k] for k in ("cameras", "side", "lights", "strands", "bounces")]
+        for name, digits in (("seconds", 1), ("gb", 2)):
+            found += [f"{row[name]:.{digits}f}", f"{row[f'estimated_{name}'] / row[name]:.2f}"]
+        return found
+
+    return markdown([*head, "GB", "est. : measured"], map(cells, rows))
+
+
+def _frames(size: Size, seed: int) -> list[dict[str, Any]]:
+    """A camera's frames of a simulated rig under each light."""
+    code = f"from {__name__} import frames_job; frames_job({size!r}, {seed})"
+    found = _child(f"from {__name__} import Size; {code}")
+    return [{"job": "frames", "size": asdict(size), **found}]
+
+
+def frames_job(size: Size, seed: int) -> None:
+    """Render the frames in this process and print their cost, JSON."""
+    rig, subject, quality = size.rig(), size.subject(seed), Quality(depth=size.bounces)
+    camera, begun = rig.cameras[0], time.process_time()
+    estimated = frames_memory(rig, subject)
+    responder = reproducible(rig, subject, Drift(1, 0.0, seed), quality, seed)
+    responder.lights(camera.name)
+    found = {
+        "seconds": time.process_time() - begun,
+        "estimated_seconds": predicted_seconds("lights", camera, len(rig.lights), quality),
+        "gb": _most_resident(),
+        "estimated_gb": estimated,
+    }
+    print(json.dumps(found))
+
+
+def _most_resident() -> float:
+    """Most memory of this process, GB; `ru_maxrss` has that of the parent."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(x.split()[1]) for x in lines if x.startswith("VmHWM")) * 1024 / 1e9
+
+
+def _fit(size: Size, seed: int, stages: str, options: dict[str, Any]) -> list[dict[str, Any]]:
+    """Stages of `hairstage fit` on true strands, and what `--estimate` says of them."""
+    with TemporaryDirectory() as folder:
+        capture, model = (Path(folder) / name for name in ("capture", "model"))
+        _shoot(size, seed, capture, model)
+        command = ["fit", str(capture), str(model), "--seed", str(seed), "--json"]
+        command += ["--stages", stages, "--options", json.dumps(options)]
+        estimated = {x["name"]: x for x in _command([*command, "--estimate"])["stages"]}
+        done = _command(command)
+        report = {x["name"]: x for x in Model(model).json("report.json")["stages"]}
+    parts = {"sun": ("samples", "roughness", "colour")}
+    seconds = {x["stage"]: x["seconds"] for x in done["stages"] if x["stage"] != "field"}
+    rows = []
+    for name, stage in estimated.items():
+        of_stage = [report[p] for p in parts.get(name, (name,)) if p in report]
+        found = of_stage or [report["inverse_rendering"]]
+        row = {
+            "seconds": seconds.get(name) or sum(x["seconds"] for x in found),
+            "estimated_seconds": stage["seconds"],
+            "gb": max(x["peak_gb"] for x in found),
+            "estimated_gb": stage["peak_gb"],
+        }
+        rows.append({"job": f"fit, {name}", "size": asdict(size), **row})
+    return rows
+
+
+def _shoot(size: Size, seed: int, capture: Path, model: Path) -> None:
+    """Write the capture of a simulated rig, and a model with its true strands."""
+    rig, subject = size.rig(), size.subject(seed)
+    responder = MitsubaResponder(rig, subject, Drift(1, 0.0, seed), Quality.scaled(SPP), seed)
+    steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(rig.lights)]
+    plan = {"steps": [s.to_dict() for s in steps]}
+    writer = CaptureWriter.create(capture, rig, plan, head=subject.head)
+    made = Model(model).create()
+    made.write_strands(subject.strands)
+    for camera in rig.cameras:
+        response = responder.lights(camera.name)
+        for step in steps:
+            image = np.zeros((camera.height * camera.width, 3), np.float32)
+            image[response.pixels] = response.image(step.index)
+            writer.write_frame(step, camera.name, image.reshape(camera.height, camera.width, 3))
+        made.write_mask(camera.name, "hair", coverage(responder._scene, camera)["hair"] > 0.5)
+    writer.finish("completed", {})
+
+
+def _command(arguments: Sequence[str]) -> dict[str, Any]:
+    """The JSON that a command of `hairstage` prints."""
+    return _child(
+        f"import sys; from stage_service.cli import main; sys.exit(main({list(arguments)!r}))"
+    )
+
+
+def _child(code: str) -> dict[str, Any]:
+    """The JSON that Python `code` prints in a process of its own; see the module's text."""
+    clock = "import os, time; time.perf_counter = time.process_time"
+    core = "os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])"
+    command = [sys.executable, "-c", f"{clock}; {core}; {code}"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{code}: {done.stderr.strip()}")
+    found: dict[str, Any] = json.loads(done.stdout)
     return found
+
+
+BENCHMARK = Benchmark(run)

@@ -1,7 +1,6 @@
-"""Our renderers beside Mitsuba's own path integrator, and how their cost grows.
+"""Our renderers beside Mitsuba's own path integrator.
 
-Error against run time light by light. Leaves `renderers.json`, `renderers.png` and
-`renderers_growth.png`.
+Error against run time light by light. Leaves `renderers.json` and `renderers.png`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from appearance import render_olat
 from appearance.render.bounces import bounce_limit
 from benchmarks.command import SUBJECT, Benchmark
-from benchmarks.renderers.cost import Effort, View, growth, growth_panels
+from benchmarks.renderers.cost import Effort, View
 from benchmarks.renderers.path_reference import PathReference
 from benchmarks.results import Panel, draw_panels, save
 from benchmarks.subjects import Subject, simulated
@@ -28,7 +27,7 @@ from reconstruction.geometry.lights import dome_positions
 
 _JUDGED = 12  # lights whose error is measured
 _STYLES = {"mitsuba path": "k.-", "ours": "C0o-"}
-QUICK = Effort((3,), 60, (2, 8), (2, 4), 128, (50, 200), (1, 2), (20, 40), 2)
+QUICK = Effort((3,), 60, (2, 8), (2, 4), 128)
 
 
 def run(
@@ -52,20 +51,14 @@ def run(
     effort = Effort() if effort is None else effort
     result: dict[str, Any] = {"camera": [camera.width, camera.height], "subjects": {}}
     for k, (name, subject) in enumerate(subjects.items()):
-        progress(name, k / (len(subjects) + 1))
+        progress(name, k / len(subjects))
         view = View.of(subject, camera, effort.pixels, seed)
         result["subjects"][name] = {
             **_Errors(view, effort).measured(),
             "strands": len(subject.strands),
         }
         save(out / "renderers.json", result)
-    subject = next(iter(subjects.values()))
-    progress("growth", len(subjects) / (len(subjects) + 1))
-    view = View.of(subject, camera, effort.pixels, seed)
-    result["growth"] = growth(subject, view, dome(36, seed), effort)
-    save(out / "renderers.json", result)
     draw_panels(out / "renderers.png", _panels(result))
-    draw_panels(out / "renderers_growth.png", [growth_panels(result)])
     return result
 
 

@@ -33,11 +33,8 @@ def test_a_small_run_writes_figures_and_plots(tmp_path, small):
     )
     result = run(tmp_path, {"tuft": subject}, small.camera(), effort=QUICK)
     assert json.loads((tmp_path / "renderers.json").read_text()) == result
-    assert all(
-        (tmp_path / f).stat().st_size > 5000 for f in ("renderers.png", "renderers_growth.png")
-    )
+    assert (tmp_path / "renderers.png").stat().st_size > 5000
     tuft = result["subjects"]["tuft"]
     assert tuft["agreement"]["ratio"] == pytest.approx(1, abs=0.1)
     errors = [p["rel_mse"] for p in tuft["lights"]["3"]["series"] if p["method"] == "ours"]
     assert errors[1] < errors[0]
-    assert set(result["growth"]["strands"]) == {"50", "200"}
