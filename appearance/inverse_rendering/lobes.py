@@ -33,6 +33,8 @@ _WIDE = np.array([1.0, 1.0, 1.0, 1.0, 0.03, 0.5, 0.5])
 intensity and the angles (radians) of its axis from the hair."""
 _MODEL = 0.01
 """Relative error of renderings, alike over `_ALIKE` values: strands and skin are not exact."""
+_KNOWN = 1e-6
+"""Prior standard deviation of a power that is given."""
 _HALVINGS = 4
 """Of a step after which the error is twice as large: the far side of a lobe is dark."""
 _STEPS, _MOST_STEP, _ALIKE, _PATHS, _SPP = 20, 0.4, 288, 1 << 22, 16
@@ -62,13 +64,18 @@ def without_axis(light: Lighting) -> bool:
 
 
 def solve_lobes(
-    problem: FitProblem, raw: Raw, pairs: Sequence[Batch], effort: Effort, seed: int = 0
+    problem: FitProblem,
+    raw: Raw,
+    pairs: Sequence[Batch],
+    effort: Effort,
+    seed: int = 0,
+    power: float | None = None,
 ) -> tuple[Array, Array]:
     """Lobes `(L, 6)` and factors `gain (L,)` of the lights of `pairs` without an axis.
 
-    The lights have one power. The hair is as `raw` has it but for a factor in each channel. If no
-    axis is determined, all lights are as calibrated, with the errors. Takes the time of two images
-    of at most 16 `effort.spp` paths a pixel.
+    The lights have one power, fitted if `power` is None. The hair is as `raw` has it but for a
+    factor in each channel. If no axis is determined, all lights are as calibrated, with the errors.
+    Takes the time of two images of at most 16 `effort.spp` paths a pixel.
     """
     lobes, gain = as_calibrated(len(problem.lights)), np.ones(len(problem.lights))
     lit = {int(i) for b in pairs for i in b.lights}
@@ -77,10 +84,12 @@ def solve_lobes(
         return lobes, gain
     pixels = sum(len(problem.views[b.view].pixels) for b in pairs)
     spp = int(np.clip(_PATHS // max(pixels, 1), 1, _SPP * effort.spp))
-    now = _Lobes.facing_hair(problem, free)
+    now = prior = _Lobes.facing_hair(problem, free, LAMBERTIAN if power is None else power)
+    wide = np.concatenate([_WIDE[:4], np.tile(_WIDE[4:], len(free))])
+    wide[3] = wide[3] if power is None else _KNOWN
     for k, paths in enumerate((max(1, spp // 8), max(1, spp // 2))):
         images = _images(problem, raw, pairs, now, replace(effort, spp=paths), seed + k, bool(k))
-        now, error = _solve(problem, now, images)
+        now, error = _solve(problem, now, prior, wide, images)
         if error[:, 0].min() > 3 * DETERMINED:
             break
     lobes[free] = np.column_stack([now.axes, np.full(len(free), now.power), error])
@@ -112,10 +121,10 @@ class _Lobes:
     power: float
 
     @classmethod
-    def facing_hair(cls, problem: FitProblem, free: list[int]) -> _Lobes:
+    def facing_hair(cls, problem: FitProblem, free: list[int], power: float) -> _Lobes:
         ahead = problem.centre - np.array([problem.lights[i].position for i in free])
         axes = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-        return cls(free, np.zeros(len(free)), axes, LAMBERTIAN)
+        return cls(free, np.zeros(len(free)), axes, power)
 
     def share(self, problem: FitProblem, k: int, points: Array) -> tuple[Array, Array]:
         """The lobe of light `k` of `free` towards `points (N, 3)`, and the derivatives `(4, N)` of
@@ -193,11 +202,11 @@ def _images(
     return [_Images(x[0], np.array(x[1:3]), *x[3:]) for x in joined]
 
 
-def _solve(problem: FitProblem, start: _Lobes, images: list[_Images]) -> tuple[_Lobes, Array]:
-    """The lobes, and standard errors `(n, 2)` of axes and power."""
-    prior, lobes = _Lobes.facing_hair(problem, start.free), start
-    wide = np.concatenate([_WIDE[:4], np.tile(_WIDE[4:], len(start.free))])
-    colour, errors = np.zeros(3), wide
+def _solve(
+    problem: FitProblem, start: _Lobes, prior: _Lobes, wide: Array, images: list[_Images]
+) -> tuple[_Lobes, Array]:
+    """The lobes, and standard errors `(n, 2)` of axes and power; `wide` are those of `prior`."""
+    lobes, colour, errors = start, np.zeros(3), wide
     squares = _squares(problem, lobes, colour, images)
     for _ in range(_STEPS):
         step, error = _step(problem, lobes, images, colour, prior, wide)

@@ -240,8 +240,7 @@ class _Fit:
         lobes, start = as_calibrated(len(gain)), gain
         left_open: dict[str, float] = {}
         for k in range(LOBE_ROUNDS):
-            seed = (self.seed << 4) + k
-            found, factors = solve_lobes(self.training, raw, pairs, self.options.effort, seed)
+            found, factors = self._solve_lobes(self.training, raw, pairs, k)
             gain = start.copy()
             gain[self.lights] *= factors
             raw, gain, left_open = self._shared(raw, gain, progress, names, found)
@@ -251,14 +250,19 @@ class _Fit:
         lobes, gain = determined(self.problem, lobes, gain)
         return raw, gain, left_open, lobes
 
+    def _solve_lobes(
+        self, problem: FitProblem, raw: Raw, pairs: Any, k: int
+    ) -> tuple[Array, Array]:
+        options, seed = self.options, (self.seed << 4) + k
+        return solve_lobes(problem, raw, pairs, options.effort, seed, options.light_power)
+
     def _add_lobes_of_held_out(self, state: State) -> None:
         """Those of the lights that were held out, on the hair that was kept."""
         assert state.lobes is not None
         rest = np.delete(np.arange(len(self.problem.lights)), self.lights)
         lit = lit_pairs(self.problem.views, self.problem.scale)
         lit[:, self.lights] = False
-        effort, seed = self.options.effort, (self.seed << 4) + 7
-        found = solve_lobes(self.problem, state.raw, _pairs(lit), effort, seed)
+        found = self._solve_lobes(self.problem, state.raw, _pairs(lit), 7)
         lobes, factors = determined(self.problem, *found)
         state.lobes[rest], state.gain = lobes[rest], state.gain.copy()
         state.gain[rest] *= factors[rest]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import field
+from typing import Annotated
+
+from pydantic import Field
 
 from reconstruction.options import Count, options
 
@@ -22,10 +25,13 @@ class InverseRenderingOptions:
 
     `shape` is the volume's (n_c, w, h) of the stages "spatial" and "correctives". The fibres' index
     stays at the start's, a fibre's 1.55, unless `free_index`: on strands that are a little off
-    their places it drifts, and changes the colour.
+    their places it drifts, and changes the colour. `light_power` is that of the cosine of lights
+    without an axis, as of a data sheet (1 for a bare LED, half as bright at 60°); None fits it, and
+    axes are less exact, by two to four times on hair under eight lights at 40 cm.
     """
 
     free_index: bool = False
+    light_power: Annotated[float, Field(ge=0, le=50)] | None = None
     shape: tuple[Count, Count, Count] = (4, 8, 8)
     effort: Effort = field(default_factory=Effort)
 
