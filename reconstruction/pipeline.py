@@ -128,8 +128,9 @@ class _Run:
             head = head or heads.fit_to_skin_points(masked, cloud)
             if not capture.olat_lights():
                 raise CaptureError(
-                    f"{capture.path}: no OLAT frames, which the method '{method}' needs; 'hull' "
-                    "takes photographs under constant light and patterns"
+                    f"{capture.path}: no OLAT frames, which the method '{method}' needs: run "
+                    "'hairstage demultiplex' first where patterns determine the lights, or use "
+                    "'hull', which takes photographs under constant light and patterns"
                 )
             scale = measuring.scale(masked, cloud, head)
             envelope, depths = measuring.envelope(masked, cloud, head.mesh, scale)

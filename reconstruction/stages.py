@@ -70,6 +70,12 @@ class MeasuringStages(Stages):
             with self.report.stage("stabilised") as stage:
                 stage.figures |= {k: v for k, v in motion.items() if k != "motion"}
 
+        if noise := capture.plan.get("demultiplexed"):
+            with self.report.stage("demultiplexed") as stage:
+                stage.figures["condition"] = noise["condition"]
+                for kind in ("read_noise_gain", "photon_noise_gain"):
+                    stage.figures[f"largest_{kind}"] = max(noise[kind].values())
+
     def undistorted(self, capture: Capture) -> Capture:
         """The capture through pinholes; the stage "lenses" has the share of pixels kept."""
         self.report.drop("lenses")

@@ -10,7 +10,7 @@ import numpy as np
 from reconstruction.arrays import Array, Bools, Floats
 from reconstruction.capture.derived import copy_frame, derived
 from reconstruction.capture.folder import Capture
-from reconstruction.capture.light_patterns import Demultiplexing
+from reconstruction.capture.light_patterns import ILL_CONDITIONED, Demultiplexing
 from reconstruction.capture.records import CaptureError, Step
 from reconstruction.capture.writer import CaptureWriter
 from reconstruction.report.report import Progress, silent
@@ -35,6 +35,13 @@ class Demultiplexed:
     solution: Demultiplexing
     misfit: float | None
     notes: tuple[str, ...]
+
+
+def determines_lights(capture: Capture) -> bool:
+    """Whether it has patterns, no single lights, and these follow from those with little error."""
+    if capture.patterns is None or capture.olat_lights():
+        return False
+    return Demultiplexing(capture.patterns.rows(capture.lightings())).condition <= ILL_CONDITIONED
 
 
 def demultiplex(source: Capture, out: Path, progress: Progress = silent) -> Demultiplexed:

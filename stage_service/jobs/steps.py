@@ -6,12 +6,15 @@ value is small and JSON-ready. After a crash a step runs again and writes the sa
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from reconstruction import Capture, Model, Progress
+from reconstruction.capture.demultiplexing import demultiplex, determines_lights
+from reconstruction.capture.records import origin
 from stage_service.jobs.records import JobOptions
 
 Figures = dict[str, Any]
@@ -28,8 +31,22 @@ class StepContext:
     previous: Mapping[str, Figures] = field(default_factory=dict)
 
     def frames(self) -> Capture:
-        """The capture, its images reduced as requested."""
-        return Capture(self.capture).view(reduced=self.options.reduced)
+        """The capture, its images reduced as requested; of patterns that determine them, single
+        lights, which are written once to the model's folder "work"."""
+        shot = Capture(self.capture)
+        if determines_lights(shot):
+            single = self.single_lights
+            made = (single / "manifest.json").is_file()
+            if not made or origin(Capture(single).plan) != origin(shot.plan):
+                shutil.rmtree(single, ignore_errors=True)
+                demultiplex(shot, single, self.progress)
+            shot = Capture(single)
+        return shot.view(reduced=self.options.reduced)
+
+    @property
+    def single_lights(self) -> Path:
+        """The folder of single lights made of patterns."""
+        return self.model.work("single_lights")
 
     def for_appearance(self) -> dict[str, Any]:
         """The arguments that the appearance's fits and assessment share."""
@@ -182,6 +199,7 @@ def results(context: StepContext) -> Figures:
         figures["label"] = context.options.label
     figures["warnings"] = [f"{s.name}: {w}" for s in report.stages for w in s.warnings]
     model.write_json("results.json", figures)
+    shutil.rmtree(context.single_lights, ignore_errors=True)
     return {"results": "results.json", "page": write_page(model).name}
 
 

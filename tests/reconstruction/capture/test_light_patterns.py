@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from reconstruction import Capture, CaptureError, CaptureWriter, Step, verify, write_exr
+from reconstruction import (
+    Capture,
+    CaptureError,
+    CaptureWriter,
+    Model,
+    Step,
+    silent,
+    verify,
+    write_exr,
+)
 from reconstruction.capture.demultiplexing import demultiplex
 from reconstruction.capture.import_folder import import_folder
 from reconstruction.capture.light_patterns import (
@@ -19,6 +28,8 @@ from reconstruction.capture.light_patterns import (
     read_patterns,
 )
 from stage_service.cli import main
+from stage_service.jobs.records import JobOptions
+from stage_service.jobs.steps import StepContext
 
 LIGHTS = [f"light_{i:02d}" for i in range(7)]
 S = (1 - hadamard(8)[1:, 1:]) // 2
@@ -130,6 +141,26 @@ def test_too_few_patterns_are_refused_and_a_table_elsewhere_is_named(tmp_path: P
     with pytest.raises(CaptureError, match="5 patterns do not determine 7 lights: 'hairstage rec"):
         demultiplex(Capture(tmp_path / "c"), tmp_path / "s")
     assert not (tmp_path / "s").exists()
+
+
+def test_a_job_takes_the_single_lights_that_patterns_determine(tmp_path: Path) -> None:
+    whole, few = (
+        import_folder(folder_of(tmp_path / f"f{len(rows)}", rows), tmp_path / f"c{len(rows)}").path
+        for rows in (S, S[:5])
+    )
+    model = Model(tmp_path / "model")
+
+    def frames(capture: Path) -> Capture:
+        return StepContext(capture, model, JobOptions(), silent).frames()
+
+    first = frames(whole)
+    for camera, singles in zip(CAMERAS, SINGLES, strict=True):
+        np.testing.assert_allclose(first.olat(camera, LIGHTS)[0], singles, atol=2e-6)
+    written = (first.path / "manifest.json").stat().st_mtime_ns
+    assert (frames(whole).path / "manifest.json").stat().st_mtime_ns == written
+    assert frames(few).lightings() == [f"p_{k}" for k in range(5)]
+    other = frames(import_folder(folder_of(tmp_path / "f", np.eye(7)), tmp_path / "c").path)
+    assert (other.path / "manifest.json").stat().st_mtime_ns > written
 
 
 def test_noisy_and_missing_frames(tmp_path: Path) -> None:
