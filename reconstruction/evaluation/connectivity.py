@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.arrays import Array
+from reconstruction.arrays import Array, Ints
 from reconstruction.evaluation.oriented_points import (
     THRESHOLDS,
     Block,
@@ -77,15 +77,18 @@ class SampledStrands:
     def look(self, block: Block) -> None:
         """Process a block of the other set; each of its strands is in one block only."""
         first, count = block.strand[0], block.strand[-1] - block.strand[0] + 1
+        parts: dict[Threshold, list[Ints]] = {t: [np.zeros(0, np.int64)] for t in self._best}
+        reach = max(t.distance for t in self._best)
+        for i, j, apart in near_pairs(self._block.points, block, reach):
+            cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
+            # count a point near several points of one strand once
+            pairs = i * count + (block.strand[j] - first)
+            for threshold, found in parts.items():
+                least = np.cos(np.radians(threshold.angle))
+                hit = (apart <= threshold.distance) & (np.abs(cosine) > least)
+                found.append(np.unique(pairs[hit]))
         for threshold, best in self._best.items():
-            least = np.cos(np.radians(threshold.angle))
-            parts = [np.zeros(0, np.int64)]
-            for i, j in near_pairs(self._block.points, block, threshold.distance):
-                cosine = np.einsum("nk,nk->n", self._block.tangents[i], block.tangents[j])
-                hit = np.abs(cosine) > least
-                # count a point near several points of one strand once
-                parts.append(np.unique(i[hit] * count + (block.strand[j[hit]] - first)))
-            point, other = np.divmod(np.concatenate(parts), count)
+            point, other = np.divmod(np.concatenate(parts[threshold]), count)
             pair, on_it = np.unique(self._owner[point] * count + other, return_counts=True)
             np.maximum.at(best, pair // count, on_it)
             if threshold == LIES_ON:

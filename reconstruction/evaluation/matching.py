@@ -37,15 +37,13 @@ class Matches:
 
     def look(self, block: Block) -> None:
         """Match unmatched points with the points of `block`."""
-        for k, threshold in enumerate(THRESHOLDS):
-            todo = np.flatnonzero(~self.directed[k])  # a directed match is an undirected one
-            for i, j in near_pairs(self.drawn.points[todo], block, threshold.distance):
-                a, b = self.drawn.tangents[todo[i]], block.tangents[j]
-                cosine = np.einsum("nk,nk->n", a, b)
-                least = np.cos(np.radians(threshold.angle))
-                # a match at a narrow threshold is one at wider ones
-                self.found[k:, todo[i[np.abs(cosine) > least]]] = True
-                self.directed[k:, todo[i[cosine > least]]] = True
+        todo = np.flatnonzero(~self.directed[0])  # a directed match is an undirected one
+        for i, j, apart in near_pairs(self.drawn.points[todo], block, THRESHOLDS[-1].distance):
+            cosine = np.einsum("nk,nk->n", self.drawn.tangents[todo[i]], block.tangents[j])
+            for k, threshold in enumerate(THRESHOLDS):
+                near, least = apart <= threshold.distance, np.cos(np.radians(threshold.angle))
+                self.found[k, todo[i[near & (np.abs(cosine) > least)]]] = True
+                self.directed[k, todo[i[near & (cosine > least)]]] = True
 
 
 def scores(

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Bools, Floats, Ints
+from reconstruction.arrays import Array, Bools, Floats, Ints
 from reconstruction.geometry.strands import Resampling, Strands, unit_or_zero
 
 PointTest = Callable[[Floats], Bools]
@@ -176,8 +176,9 @@ def _directions(before: Floats, after: Floats) -> Floats:
     return unit_or_zero(after.astype(float) - before).astype(np.float32)
 
 
-def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints]]:
-    """Indices `(N,)`, `(N,)` of points and points of `other` at most `reach` metres apart.
+def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Ints, Ints, Array]]:
+    """Indices `(N,)`, `(N,)` of points and points of `other` at most `reach` metres apart, and the
+    distances `(N,)`.
 
     In parts of about `MOST_PAIRS`, with all pairs of a point in one part.
     """
@@ -190,4 +191,4 @@ def near_pairs(points: Floats, other: Block, reach: float) -> Iterator[tuple[Int
         if len(chunk):
             tree = cKDTree(points[chunk])
             pairs = tree.sparse_distance_matrix(other.tree, reach, output_type="ndarray")
-            yield chunk[pairs["i"]], pairs["j"]
+            yield chunk[pairs["i"]], pairs["j"], pairs["v"]
