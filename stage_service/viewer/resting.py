@@ -9,11 +9,14 @@ import numpy as np
 from appearance import HairScene
 from appearance.render.coverage import coverage
 from appearance.render.olat import render_indirect, spread_out
-from appearance.render.smoothed import SIGMA, smoothed
+from appearance.render.smoothed import smoothed
 from reconstruction import Camera, Light
 from reconstruction.arrays import Array, Floats
 from reconstruction.options import Count, options
 
+SIGMA = 0.8
+"""Standard deviation, pixels, of the filter of traced light. A wider one blurs more than it
+reduces the noise of `RestOptions.spp` paths where most light is indirect."""
 _OTHER = 0.02
 """Weight of a head pixel for hair, and of a hair pixel for the head."""
 
@@ -23,7 +26,7 @@ class RestOptions:
     """`spp` paths per pixel of at most `max_depth` vertices; later vertices sample `deep_lights`
     lights."""
 
-    spp: Count = 48
+    spp: Count = 96
     max_depth: Count = 24
     deep_lights: Count = 8
 

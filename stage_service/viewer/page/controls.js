@@ -38,7 +38,7 @@ export class Controls {
     panel.replaceChildren(
       element("h1", { textContent: about.name }),
       element("p", { textContent: `${count(model.count)} strands of ${model.points} points. Distance of ` +
-        `the model's points from them: median ${half} mm, 95 % ${most} mm, maximum ${all} mm.` }),
+        `the rendered curves from them: median ${half} mm, 95 % ${most} mm, maximum ${all} mm.` }),
       ...this.strands(), ...this.cameras());
     this.light().catch((error) => viewer.status(error.message));
   }
