@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -99,6 +100,7 @@ def assess(
         elif held_out.cameras or held_out.lights:
             comparison = _Comparison(capture, training, model, fitted, held_out, options, seed)
             result = comparison.run(stage, progress)
+            shutil.rmtree(model.work("images"), ignore_errors=True)
         else:
             stage.warn("no camera and no light is held out: nothing is compared")
     model.write_report(report)
@@ -232,7 +234,8 @@ class _Comparison:
         training, views = self.training.olat_lights(), dict[str, NearestCameras | None]()
         if not images:
             return
-        frames = FromFrames.of(self.fitted, self.model, self.training)
+        folder = self.model.work("images")  # of a large capture they exceed memory
+        frames = FromFrames.of(self.fitted, self.model, self.training, folder=folder)
         lights = self.fitted.lights(list({image.light.name: None for image in images}))
         relit: NewViews | None = None
         if not own and len(frames.field.views) > 1:

@@ -125,6 +125,7 @@ def test_pictures_and_report_are_left_in_the_model(made, result):
     assert not unbeaten
     comparison = cv2.imread(str(model.file("comparison.png")))
     assert comparison.shape[1] > comparison.shape[0] / 2 > 200
+    assert not model.work("images").exists()
 
 
 def test_a_baseline_that_is_not_beaten_is_warned_of():
