@@ -63,6 +63,11 @@ def without_axis(light: Lighting) -> bool:
     return isinstance(light, Light) and light.orientation is None
 
 
+def paths_a_pixel(pixels: int, effort: Effort) -> int:
+    """Of `solve_lobes`, for views of so many `pixels` in total; an eighth of them come first."""
+    return int(np.clip(_PATHS // max(pixels, 1), 1, _SPP * effort.spp))
+
+
 def solve_lobes(
     problem: FitProblem,
     raw: Raw,
@@ -83,7 +88,7 @@ def solve_lobes(
     if not free:
         return lobes, gain
     pixels = sum(len(problem.views[b.view].pixels) for b in pairs)
-    spp = int(np.clip(_PATHS // max(pixels, 1), 1, _SPP * effort.spp))
+    spp = paths_a_pixel(pixels, effort)
     now = prior = _Lobes.facing_hair(problem, free, LAMBERTIAN if power is None else power)
     wide = np.concatenate([_WIDE[:4], np.tile(_WIDE[4:], len(free))])
     wide[3] = wide[3] if power is None else _KNOWN

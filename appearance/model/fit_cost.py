@@ -10,7 +10,7 @@ import numpy as np
 
 from appearance.fields.options import FieldRequest
 from appearance.fields.pipeline import memory_needed as field_memory
-from appearance.inverse_rendering.lobes import without_axis
+from appearance.inverse_rendering.lobes import paths_a_pixel, without_axis
 from appearance.inverse_rendering.loop import SHARED_LIGHTS, SHARED_VIEWS
 from appearance.inverse_rendering.memory import Sizes, memory_needed, scene_memory
 from appearance.inverse_rendering.options import InverseRenderingRequest
@@ -27,21 +27,19 @@ from reconstruction.geometry.lights import components
 from reconstruction.report.report import resident_memory
 
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
-_PATHS = {"sun": 5e5, "shared": 87.0, "spatial": 6e5, "correctives": 2e5, "field": 5e5}
+_PATHS = {"sun": 5e5, "shared": 87.0, "correctives": 5e5, "field": 3e5}
 """Paths of the stages whatever the size, in paths of the probe; of shared for each of a patch's."""
-_SUN_PATH, _TURN_PATH, _CALL = 19.0, 3.0, 1800.0
-"""Further ones: of sun for each colour path of an observed pixel, of correctives for each cached
-path and light, and of each rendering of a view."""
-_SUN_CALLS, _CELL_CALLS = 9, 18
-"""Renderings of each view by sun, and by spatial."""
+_SUN_PATH, _CELL_PATH, _TURN_PATH, _LOBE_PATH = 19.0, 36.0, 1.4, 5.5
+"""Further ones: of sun for each colour path of an observed pixel (9 renderings, each path twice the
+probe's), of spatial for each path of a round (18 of them), of correctives for each cached path and
+light, and of each coarse path for the axes of lights, where none is determined."""
 _LIBRARIES_GB = 0.15
 """Of LLVM, which the first rendering loads."""
 _SUN_BYTES = 100
 """Of a pixel under a light: copies of frames, and three renderings at once."""
-_FIELD_DIRECT, _FIELD_INDIRECT = 1.2, 0.044
-"""Of a field, for each light of a pixel: direct light, and each of its paths of indirect light."""
-_LOBES = 1.4e6
-"""Further paths of lights without an axis, if none is determined."""
+_FIELD_PIXEL, _FIELD_DIRECT, _FIELD_INDIRECT = 35.0, 1.2, 0.044
+"""Of a field for each fitted pixel, and for each rendered pixel and light: direct light, and each
+path of indirect light."""
 _JUDGED = 1 << 20
 """Paths of the held-out frames of a guess."""
 _SAMPLES = 10_000
@@ -84,19 +82,20 @@ def estimate_fit(
     of_patches = min(SHARED_VIEWS, views) * min(SHARED_LIGHTS, fitted)
     judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
     shared = _PATHS["shared"] * of_patches * effort.pixels * effort.spp / SHARED_LIGHTS + judged
+    cells = sum(pixels) * np.clip(1e5 // max(sum(pixels), 1), 1, max(effort.spp // 4, 1))
     cached = sum(pixels) * direct_spp(sum(pixels)) * min(fitted, request.lights)
+    lobes = sum(pixels) * 2 * (paths_a_pixel(sum(pixels), effort) // 8)
     most_lights, most = field.resolved(views, len(strands))
     of_field, many = [min(n, most) for n in hair], min(lights, most_lights)
     paths = {
-        "sun": _PATHS["sun"]
-        + _SUN_PATH * sun.colour_spp * sum(observed)
-        + _CALL * _SUN_CALLS * views,
+        "sun": _PATHS["sun"] + _SUN_PATH * sun.colour_spp * sum(observed),
         "shared": shared,
-        "spatial": _PATHS["spatial"] + _CALL * _CELL_CALLS * views + shared,
+        "spatial": shared + _CELL_PATH * cells,
         "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
-        "lights": shared + (_LOBES if any(map(without_axis, lightings)) else 0),
+        "lights": shared + _LOBE_PATH * lobes * any(map(without_axis, lightings)),
         # every pixel of the subject is rendered, for what is smooth
         "field": _PATHS["field"]
+        + _FIELD_PIXEL * sum(of_field)
         + sum(shown) * many * (_FIELD_DIRECT + _FIELD_INDIRECT * field.spp),
     }
     points = len(strands.points)

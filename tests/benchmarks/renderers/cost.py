@@ -1,6 +1,6 @@
 """Cost against size: CPU seconds and memory of frames and fits, compared with their estimates.
 
-Each job is a process of its own, on one core, whose clock counts CPU seconds, so that other work
+Each job is a process of its own, on one core or thread, whose clock counts CPU seconds: other work
 on the machine does not count. Leaves `cost.json` and `cost.md`.
 """
 
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,8 +28,9 @@ from benchmarks.subjects import Subject
 from reconstruction import Camera, CaptureWriter, Light, Model, Progress, Rig, Step, Strands
 from reconstruction.arrays import Ints
 from reconstruction.geometry.lights import dome_positions
+from simulators.frames.render_process import RenderProcess
 from simulators.frames.responses import MitsubaResponder, Quality, frames_memory, reproducible
-from simulators.frames.work import predicted_seconds
+from simulators.frames.work import COSTS, predicted_seconds
 from simulators.subject.drift import Drift
 from simulators.subject.subject import Subject as Simulated
 from simulators.subject.subject import make_subject
@@ -169,32 +171,31 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _frames(size: Size, seed: int) -> list[dict[str, Any]]:
-    """A camera's frames of a simulated rig under each light."""
-    code = f"from {__name__} import frames_job; frames_job({size!r}, {seed})"
-    found = _child(f"from {__name__} import Size; {code}")
-    return [{"job": "frames", "size": asdict(size), **found}]
-
-
-def frames_job(size: Size, seed: int) -> None:
-    """Render the frames in this process and print their cost, JSON."""
+    """A camera's frames of a simulated rig under each light, in the rig's own rendering process."""
     rig, subject, quality = size.rig(), size.subject(seed), Quality(depth=size.bounces)
-    camera, begun = rig.cameras[0], time.process_time()
-    estimated = frames_memory(rig, subject)
-    responder = reproducible(rig, subject, Drift(1, 0.0, seed), quality, seed)
-    responder.lights(camera.name)
-    found = {
-        "seconds": time.process_time() - begun,
-        "estimated_seconds": predicted_seconds("lights", camera, len(rig.lights), quality),
-        "gb": _most_resident(),
-        "estimated_gb": estimated,
+    camera, drift = rig.cameras[0], Drift(1, 0.0, seed)
+    before = _seconds_of_children()
+    process = RenderProcess(partial(reproducible, rig, subject, drift, quality, seed))
+    try:
+        process.lights(camera.name)
+        status = Path(f"/proc/{process._process.pid}/status").read_text()
+    finally:
+        process.stop()
+    most = next(int(x.split()[1]) for x in status.splitlines() if x.startswith("VmHWM"))
+    estimated = predicted_seconds("lights", camera, len(rig.lights), quality)
+    row = {
+        "seconds": _seconds_of_children() - before,
+        "estimated_seconds": estimated + COSTS["lights"].first,
+        "gb": most * 1024 / 1e9,
+        "estimated_gb": frames_memory(rig, subject),
     }
-    print(json.dumps(found))
+    return [{"job": "frames", "size": asdict(size), **row}]
 
 
-def _most_resident() -> float:
-    """Most memory of this process, GB; `ru_maxrss` has that of the parent."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(x.split()[1]) for x in lines if x.startswith("VmHWM")) * 1024 / 1e9
+def _seconds_of_children() -> float:
+    """CPU seconds of the processes that ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _fit(size: Size, seed: int, stages: str, options: dict[str, Any]) -> list[dict[str, Any]]:
