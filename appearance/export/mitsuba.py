@@ -14,11 +14,11 @@ from scipy.cluster.vq import kmeans2
 
 from appearance.bsdf.maps import HairMaps
 from appearance.export.groom import Groom
-from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE, mitsuba_hair
 from reconstruction import Camera, Mesh, write_exr, write_obj
 from reconstruction.arrays import AnyFloats, Array, Ints
 from reconstruction.files.durable import write_whole, writing
+from reconstruction.geometry.splines import spline_control_points
 
 GROUPS = 32
 """Shapes of one colour each."""

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from appearance.scene.backend import ensure_backend
-from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair, HairAppearance
 from reconstruction import Camera, Mesh, Strands
 from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Floats, Ints
+from reconstruction.geometry.splines import spline_control_points
 
 SCALE = 100.0
 """Scene units per metre."""
@@ -104,7 +104,7 @@ def build_scene(
 ) -> HairScene:
     """Build the scene of `strands` on `head`; either may be empty or absent.
 
-    Strands become round cubic curves through their points (see `appearance.scene.curves`); the
+    Strands become round cubic curves through their points (`reconstruction.geometry.splines`); the
     head is a two-sided Lambertian surface of albedo `skin (3,)` in [0, 1] with flat faces, or of
     `materials` per face. Raises `ValueError` for albedos out of range.
     """

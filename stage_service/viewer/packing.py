@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from reconstruction import Strands
 from reconstruction.arrays import Array, Floats, Ints
+from reconstruction.geometry.splines import spline_control_points
 
 POINTS = (16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Possible numbers of points per strand, equal for all strands of a set."""
@@ -86,8 +87,6 @@ class PackedStrands:
 
 def _with_middles(strands: Strands) -> Strands:
     """`strands` with a point in the middle of each segment of the renderer's splines."""
-    from appearance.scene.curves import spline_control_points  # imports Mitsuba
-
     control, first = spline_control_points(strands)
     pieces = control[first[:, None] + np.arange(4), :3]
     offsets = 2 * strands.offsets - np.arange(len(strands.offsets))

@@ -16,9 +16,9 @@ from appearance.bsdf import reference
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.parameters import StrandHit
 from appearance.bsdf.strand_coordinates import strand_parameters
-from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_scene import SCALE
 from reconstruction import Strands
+from reconstruction.geometry.splines import spline_control_points
 
 HAIR = HairAppearance((0.2, 0.4, 0.8), 0.3, 0.3)
 

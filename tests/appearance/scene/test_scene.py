@@ -6,11 +6,11 @@ import pytest
 
 from appearance import HairAppearance, build_scene, render_olat
 from appearance.render.coverage import coverage
-from appearance.scene.curves import spline_control_points
 from appearance.scene.hair_appearance import DiffuseHair
 from appearance.scene.hair_scene import SCALE, _guarded
 from reconstruction import Camera, Light, Strands
 from reconstruction.array_backend import for_kernels
+from reconstruction.geometry.splines import spline_control_points
 
 HAIR = HairAppearance((0.1, 0.2, 0.45), 0.3, 0.3)
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reconstruction import Strands
 from reconstruction.arrays import Array, Ints
+from reconstruction.geometry.strands import Strands
 
 MOST_UNEVEN = 2.0
 """Ratio of a strand's longest to its shortest segment above which a uniform spline overshoots."""
