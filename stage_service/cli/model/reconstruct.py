@@ -105,7 +105,7 @@ def _check_folder(out: Path) -> None:
             "choose a "
             "new folder"
         )
-    if there and not there & {"masks", "strands.npz", "report.json"}:
+    if there and not there & {"masks", "strands.npz", "report.json", "work"}:
         raise BadArgument(
             f"--out {out} has files that are no model's, and a model may replace them: choose a "
             "new "

@@ -163,6 +163,23 @@ def test_a_job_takes_the_single_lights_that_patterns_determine(tmp_path: Path) -
     assert (other.path / "manifest.json").stat().st_mtime_ns > written
 
 
+def test_a_reconstruction_that_was_killed_while_demultiplexing_begins_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture, model = (
+        import_folder(folder_of(tmp_path / "f", S), tmp_path / "c").path,
+        tmp_path / "m",
+    )
+    (model / "work" / "single_lights").mkdir(parents=True)
+    (model / "work" / "single_lights" / "rig.json").write_text("{}")
+    begun = []
+    monkeypatch.setattr("stage_service.jobs.steps.demultiplex", lambda *given: begun.append(given))
+    main(["reconstruct", str(capture), "--out", str(model)])
+    assert "no model's" not in capsys.readouterr().err
+    assert [out for _, out, _ in begun] == [model / "work" / "single_lights"]
+    assert not (model / "work" / "single_lights").exists()
+
+
 def test_noisy_and_missing_frames(tmp_path: Path) -> None:
     """Twice the patterns: a noisy frame weighs less, a missing one is done without."""
     weights = np.concatenate([S, np.eye(7)])
