@@ -36,8 +36,7 @@ class StepContext:
         shot = Capture(self.capture)
         if determines_lights(shot):
             single = self.single_lights
-            made = (single / "manifest.json").is_file()
-            if not made or origin(Capture(single).plan) != origin(shot.plan):
+            if not _made_of(single, shot):
                 shutil.rmtree(single, ignore_errors=True)
                 demultiplex(shot, single, self.progress)
             shot = Capture(single)
@@ -60,6 +59,16 @@ class StepContext:
             "progress": self.progress,
             "seed": options.seed,
         }
+
+
+def _made_of(single: Path, shot: Capture) -> bool:
+    """Whether `single` is whole, of this capture, and newer than its table and frames."""
+    done = single / "manifest.json"
+    if not done.is_file() or origin(Capture(single).plan) != origin(shot.plan):
+        return False
+    files = [shot.path / "plan.json", shot.path / "journal.jsonl"]
+    written = max(file.stat().st_mtime_ns for file in files if file.is_file())
+    return done.stat().st_mtime_ns >= written
 
 
 def compress(context: StepContext) -> Figures:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -161,6 +162,12 @@ def test_a_job_takes_the_single_lights_that_patterns_determine(tmp_path: Path) -
     assert frames(few).lightings() == [f"p_{k}" for k in range(5)]
     other = frames(import_folder(folder_of(tmp_path / "f", np.eye(7)), tmp_path / "c").path)
     assert (other.path / "manifest.json").stat().st_mtime_ns > written
+    shutil.rmtree(tmp_path / "c")  # imported again, with another table of the same folder
+    rows = (tmp_path / "f" / "patterns.csv").read_text().splitlines()
+    turned = [rows[0], *(f"p_{k},{row.split(',', 1)[1]}" for k, row in enumerate(rows[:0:-1]))]
+    (tmp_path / "f" / "patterns.csv").write_text("\n".join(turned))
+    again = frames(import_folder(tmp_path / "f", tmp_path / "c").path)
+    np.testing.assert_allclose(again.olat("left", LIGHTS)[0], SINGLES[0][::-1], atol=2e-6)
 
 
 def test_a_reconstruction_that_was_killed_while_demultiplexing_begins_anew(
