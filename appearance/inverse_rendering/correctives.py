@@ -111,7 +111,7 @@ class _View:
         if self.weight is None:
             # fixed at the start: later weights would select noise
             weight = np.where(compared.valid[..., None], losses.weights(compared.level), 0)
-            self.weight = losses.noise_weighted(weight, off[0] * off[0])
+            self.weight = losses.noise_weighted(weight, off[0] * off[0], compared.level)
         return pictures, off
 
 

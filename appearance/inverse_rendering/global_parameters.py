@@ -157,7 +157,7 @@ class _System:
         self.patches = [problem.patch(b, self.effort.pixels, rng) for b in evidence.pairs]
         self.wide = np.array([WIDE[name] for name, _ in numbers])
         self.bends = np.array([name != "gain" for name, _ in numbers])
-        self.noise: list[Array] = [np.zeros(0)] * len(self.patches)
+        self.noise: list[tuple[Array, Array] | None] = [None] * len(self.patches)
         self.error = np.ones(len(numbers))
 
     def left_open(self) -> dict[str, float]:
@@ -207,10 +207,11 @@ class _System:
         halves = pictures.picture()
         seen = self.problem.compare(patch, halves.mean(axis=0))
         weight = np.where(seen.valid[..., None], losses.weights(seen.level), 0)
-        if self.noise[k].size:
+        if (known := self.noise[k]) is not None:
             # of other paths: weights from this image's noise would select among it
-            weight = losses.noise_weighted(weight, self.noise[k])
-        self.noise[k] = (halves[0] - halves[1]) ** 2
+            weight = losses.noise_weighted(weight, *known)
+        light = 0.5 * (seen.captured + halves.mean(axis=0))
+        self.noise[k] = (halves[0] - halves[1]) ** 2, light
         left, right = [], []
         for name, i in self.numbers:
             if name == "gain":

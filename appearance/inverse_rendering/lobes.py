@@ -196,7 +196,7 @@ def _images(
         seen = problem.compare(patch, rendered.mean(axis=0))
         weight = np.where(seen.valid[..., None], (seen.level + FLOOR) ** -2, 0)
         # a rare bright path would outweigh all others in dark pixels
-        weight = noise_weighted(weight, (rendered[0] - rendered[1]) ** 2)
+        weight = noise_weighted(weight, (rendered[0] - rendered[1]) ** 2, seen.level)
         for j, i in enumerate(patch.lights):
             if i in lobes.free:
                 n = lobes.free.index(int(i))

@@ -70,15 +70,26 @@ def test_maps_are_saved_with_the_strands_places_and_bad_ones_refused(tmp_path):
         HairMaps(-np.ones((1, 1, 1, 3)), np.zeros((1, 1, 1, 2)), 0.3, 0.3)
 
 
-def test_noisy_pixels_count_less_and_all_together_as_much():
+def test_noisy_light_counts_less_and_all_together_as_much():
     rng = np.random.default_rng(2)
-    weight = np.ones((1, 500, 3))
+    weight, level = np.ones((1, 500, 3)), rng.uniform(size=(1, 500, 3))
     weight[:, 400:] = 0  # not valid
     squares = rng.exponential(size=weight.shape)
-    squares[:, 100:110] *= 1e4
-    quiet = losses.noise_weighted(weight, squares)
+    level[:, 100:120] += 2
+    squares[:, 100:120] *= 1e4
+    quiet = losses.noise_weighted(weight, squares, level)
     assert quiet.sum() == pytest.approx(weight.sum())
-    assert quiet[:, 102:108].max() < 0.01 * np.median(quiet[:, :400])
+    assert quiet[:, 100:120].max() < 0.01 * np.median(quiet[:, :400])
     assert (quiet[:, 400:] == 0).all()
     for nothing in (np.zeros_like(weight), weight):
-        assert (losses.noise_weighted(nothing, np.zeros_like(weight)) == nothing).all()
+        assert (losses.noise_weighted(nothing, np.zeros_like(weight), level) == nothing).all()
+
+
+def test_weights_do_not_depend_on_which_of_two_equally_bright_pixels_is_noisy():
+    rng = np.random.default_rng(3)
+    level = rng.uniform(size=(2, 3000, 3))
+    rendered_bright = rng.uniform(size=level.shape[:2]) < 0.5  # the captured image is, elsewhere
+    squares = np.where(rendered_bright[..., None], 100.0, 0.01) * rng.exponential(size=level.shape)
+    found = losses.noise_weighted(np.ones_like(level), squares, level)
+    one, other = found[rendered_bright].mean(), found[~rendered_bright].mean()
+    assert one == pytest.approx(other, rel=0.05)
