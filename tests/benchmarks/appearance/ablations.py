@@ -142,6 +142,7 @@ def run_at_size(
         found = []
         # the index of fibres on strands that are off drifts: users' fits hold it, too
         fit = replace(options, free_index=name != RECONSTRUCTED)
+        result.setdefault("free_index", {})[name] = fit.free_index
         for k in range(runs.seeds):
             table = Table(captured, fit, progress=within(progress, f"({name})"), seed=seed + k)
             variants = table.run()
