@@ -24,7 +24,7 @@ from reconstruction.array_backend import for_kernels
 from reconstruction.arrays import Array, Ints
 
 Shape = tuple[int, int, int]
-_RAYS = 8
+_RAYS, _ROUNDS = 8, 12
 _PATHS = 100_000
 """Paths of a round, over all views."""
 _WIDE = 0.02
@@ -37,7 +37,6 @@ def absorption_of_cells(
     gain: Array,
     effort: Effort,
     *,
-    rounds: int = 12,
     whole: int = 4,
     seed: int = 0,
 ) -> HairMaps:
@@ -54,7 +53,7 @@ def absorption_of_cells(
     cells = [visible_cells(problem, o, maps.shape, seed) for o in problem.views]
     captured = [_mean(o, o.radiance.astype(float) * problem.scale) for o in problem.views]
     colour = np.exp(-BRACKET * np.sqrt(maps.sigma_a))
-    for k in range(rounds):
+    for k in range(_ROUNDS):
         sums = np.zeros((2, *maps.shape, 3))
         trial = replace(maps, sigma_a=(np.log(colour) / BRACKET) ** 2)
         now = raw | {"sigma_a": encode_absorption(trial.sigma_a)}

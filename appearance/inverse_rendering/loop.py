@@ -44,8 +44,6 @@ LEAST_PIXELS = 1.0
 """Hair pixels of all views for each cell of the volume, below which no cell is fitted."""
 GOOD = 0.005
 """Error in displayed values that no stage is run to lower."""
-_MORE_ROUNDS = 6
-"""Rounds of the cells after the global parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +112,8 @@ class _Fit:
         self.training, self.lights = self.split.training, self.split.lights
         colour = ("sigma_a", "beta_m", "beta_n", "eta")
         self.colour = [name for name in colour if options.free_index or name != "eta"]
+        self._judged: tuple[Array, Array] | None = None
+        """`_squares` of what was kept last, once it is known."""
 
     def run(
         self, maps: HairMaps, gain: Array, stages: Sequence[Material], monitor: Monitor
@@ -141,25 +141,31 @@ class _Fit:
         progress("fitting", 0.0)
         raw, gain, left_open, *lobes = self._solvers[stage](state.raw, state.gain, progress)
         progress("rendering held-out frames", 0.9)
-        seed = (self.seed << 16) + ((1 + len(state.decisions)) << 24)
-        held_out, lit_by = self.split.held_out, []
         state.lobes = lobes[0] if lobes else state.lobes
-        if lobes and np.isfinite(lobes[0][:, 3]).any():
-            held_out, given = self.split.frames_of_fitted(), self.problem.lights
-            lit_by = [given, with_lobes(given, lobes[0])]
-        guesses = [(state.raw, state.gain), (raw, gain)]
-        (before, after), counts = self.problem.squares(
-            guesses, held_out, self.options.effort, seed, lit_by
-        )
-        decision = decide(stage, before, after, counts, time.perf_counter() - begun)
+        lit, frames = self.problem, self.split.held_out
+        turned = bool(lobes) and bool(np.isfinite(lobes[0][:, 3]).any())
+        if turned:  # the lights that are held out have no lobes yet
+            lit = self.problem.under(with_lobes(self.problem.lights, lobes[0]))
+            self._judged, frames = None, self.split.frames_of_fitted()
+        before = self._judged or self._squares(self.problem, state.raw, state.gain, frames)
+        after = self._squares(lit, raw, gain, frames)
+        decision = decide(stage, before[0], after[0], before[1], time.perf_counter() - begun)
         state.decisions.append(decision)
+        if not turned:
+            self._judged = after if decision.kept else before
         if decision.kept:
             state.raw, state.gain = raw, gain
             state.left_open = left_open or state.left_open
-            if lit_by:
+            if turned:
                 self._add_lobes_of_held_out(state)
         elif state.lobes is not None:
             state.lobes[:, :4] = np.nan
+
+    def _squares(
+        self, problem: FitProblem, raw: Raw, gain: Array, frames: Bools
+    ) -> tuple[Array, Array]:
+        seed = (self.seed << 16) + (1 << 24)
+        return problem.squares(raw, gain, frames, self.options.effort, seed)
 
     def _skipped(self, stage: Material, state: State) -> str:
         """Why a stage cannot pay for its cost; empty if it may."""
@@ -216,15 +222,10 @@ class _Fit:
         return raw, gain, left_open
 
     def _spatial(self, raw: Raw, gain: Array, progress: Progress) -> _Solved:
-        raw = self._cells(self._in_cells(raw), gain, 0)
-        raw, gain, left_open = self._shared(raw, gain, progress)
-        return self._cells(raw, gain, 1), gain, left_open
-
-    def _cells(self, raw: Raw, gain: Array, number: int) -> Raw:
-        more = {"rounds": _MORE_ROUNDS, "whole": 0} if number else {}
-        effort, seed = self.options.effort, (self.seed << 4) + number
-        maps = absorption_of_cells(self.training, raw, gain[self.lights], effort, seed=seed, **more)
-        return encode(maps)
+        effort, seed = self.options.effort, self.seed << 4
+        raw = self._in_cells(raw)
+        maps = absorption_of_cells(self.training, raw, gain[self.lights], effort, seed=seed)
+        return encode(maps), gain, {}
 
     def _correctives(self, raw: Raw, gain: Array, progress: Progress) -> _Solved:
         effort, seed = self.options.effort, (self.seed << 4) + 15

@@ -20,8 +20,8 @@ _POINT_BYTES, _BUILDING_BYTES = 225, 375
 """The same with its coordinates on the hair, and at most while those are computed."""
 _FRAME_BYTES = 25
 """Of a captured pixel under a light."""
-_WHOLE_BYTES, _GUESS_BYTES = 72, 120
-"""Of a pixel under a light where full images are compared, and of each guess there."""
+_WHOLE_BYTES = 480
+"""Of a fitted pixel under a light where full images, of six times as many pixels, are compared."""
 _PATH_BYTES = 3000
 """Of a cached path."""
 _TURN_BYTES, _LIT_BYTES = 96, 30
@@ -54,7 +54,7 @@ def scene_memory(points: int, beside: float = 0.0, *, mapped: bool = True) -> fl
 def memory_needed(sizes: Sizes, options: InverseRenderingOptions) -> float:
     """GB that a fit takes, scene and kernels too, beside what the program holds before, about."""
     pixels, largest, lights = sum(sizes.views), max(sizes.views, default=0), sizes.lights
-    whole = largest * lights * (_WHOLE_BYTES + 2 * _GUESS_BYTES)
+    whole = largest * lights * _WHOLE_BYTES
     kept = min(largest, options.effort.pixels) * max(FEWEST, 2 * options.effort.spp)
     turns = pixels * lights * (_TURN_BYTES + direct_spp(pixels) * _LIT_BYTES)
     fitting = pixels * lights * _FRAME_BYTES + max(whole, kept * _PATH_BYTES, turns)

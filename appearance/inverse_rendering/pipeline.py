@@ -30,6 +30,8 @@ FILES = "hair_maps.npz", LIGHTS_FILE
 MOST_DEPTH = 16
 FLAT = 0.7
 """Standard error over the prior's width above which the response is flat: of its square, half."""
+_SHOWN = 4
+"""Hair pixels of an image for each one that is fitted."""
 FROM_SUN = 1.15
 """Ratio to Sun's roughness, or its inverse, above which a fitted roughness is doubtful."""
 BLACKER = 3.0
@@ -61,6 +63,7 @@ def fit_maps(
     positions = np.array([training.lighting(name).position for name in names])
     held = min(request.validation_lights, len(names) // 4)
     training = training.view(lights=[names[k] for k in far_apart(positions, request.lights + held)])
+    training = reduced_for_fit(training, model, request.hair_pixels)
     fitted, strands, head = FittedAppearance.load(model), model.strands(), model.head(capture)
     report = model.report()
     with report.stage("inverse_rendering") as stage:
@@ -198,6 +201,16 @@ def _check_memory(
             f"{needed:.1f} GB of memory, and {free:.1f} GB are free: lower hair_pixels, now "
             f"{request.hair_pixels}, or hold out more lights"
         )
+
+
+def reduced_for_fit(training: Capture, model: Model, pixels: int) -> Capture:
+    """`training` with the means of so many pixels that hair has about `_SHOWN` times `pixels`.
+
+    Frames that decide are rendered whole, and strands are off by more than a fine pixel.
+    """
+    most = max(int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras)
+    by = int((most / (_SHOWN * pixels)) ** 0.5)
+    return training.view(reduced=by * training.reduced_by) if by > 1 else training
 
 
 def root_uv(model: Model, strands: Strands, head: Mesh | None) -> Array:

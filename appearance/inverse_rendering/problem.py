@@ -14,9 +14,12 @@ from appearance.inverse_rendering.batches import Batch, Comparison, Patch
 from appearance.inverse_rendering.linearised import LinearisedPictures
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.unknowns import Raw, decode
+from appearance.metrics.scores import srgb
 from appearance.observations import Observed
 from appearance.render.cached_paths import CachedPaths, CachedSampling, WeightedPixels, cache_paths
 from appearance.render.olat import render_indirect, render_olat
+from appearance.render.smoothed import olat_smoothed
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import SCALE, HairScene, light_arrays
 from appearance.sun_fit.visible_fibres import visible_fibres
 from reconstruction import Camera
@@ -29,7 +32,7 @@ _ALL = 1e-9
 """Dimmest light that casts shadow rays, so low that the choice does not depend on the hair."""
 _LEAST_SPP = 16
 """Least paths a pixel of indirect light."""
-_WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 20, 4, 9
+_WHOLE_PATHS, _LEAST_PATHS, _PARTS = 1 << 17, 4, 9
 """Paths of full images of all views, least paths a pixel, and parts of a view's hair."""
 _FIRST_LIGHTS, _DEEP_LIGHTS = 8, 3
 """Lights sampled at a path's first and later vertices, for means over lights."""
@@ -55,6 +58,11 @@ class DirectLight:
 def direct_spp(pixels: int) -> int:
     """Cached one-vertex paths a pixel, for views of so many `pixels` in total."""
     return int(np.clip(_DIRECT_PATHS // max(pixels, 1), _FEWEST, _MOST))
+
+
+def judging_spp(pixels: int, effort: Effort) -> int:
+    """Paths a pixel of frames that decide, for views of so many `pixels` in total."""
+    return int(np.clip(_WHOLE_PATHS // max(2 * pixels, 1), _LEAST_PATHS, effort.spp))
 
 
 class FitProblem:
@@ -107,47 +115,30 @@ class FitProblem:
         return np.where(count > 0, mean, self.centre)
 
     def squares(
-        self,
-        guesses: Sequence[tuple[Raw, Array]],
-        used: Bools,
-        effort: Effort,
-        seed: int,
-        lit_by: Sequence[Sequence[Lighting]] = (),
+        self, raw: Raw, gain: Array, used: Bools, effort: Effort, seed: int
     ) -> tuple[Array, Array]:
-        """Sums of weighted squared errors of each guess `(G, V, B)`, and their counts `(V, B)`.
+        """Sums of squared errors of displayed (sRGB) values, and their counts `(V, B)`.
 
-        Of all hair pixels of the V views of the pairs `used (V', L)`, without noise, under the same
-        weights for all guesses; `lit_by` are the lights of each guess, where they differ. The B
-        parts are a view's pixels, with own paths, in image order.
+        Of all hair pixels of the V views of the pairs `used (V', L)`: products of the errors of two
+        independent images. Indirect light is smoothed (`olat_smoothed`), as the curve would make
+        its noise an error. The B parts are a view's pixels, with own paths, in image order.
         """
         views = [k for k in range(len(self.views)) if used[k].any()]
-        paths = _WHOLE_PATHS // (2 * sum(len(self.views[k].pixels) for k in views))
-        spent = {
-            "spp": int(np.clip(paths, _LEAST_PATHS, 8 * effort.spp)),
-            "max_depth": effort.max_depth,
-        }
-        problems = [self.under(x) for x in lit_by] or [self] * len(guesses)
+        spp = judging_spp(sum(len(self.views[k].pixels) for k in views), effort)
         sums, counts = [], []
         for k in views:
             o, lights = self.views[k], np.flatnonzero(used[k])
             patch = Patch(k, lights, np.arange(len(o.pixels)))
-            halves = np.zeros((len(guesses), 2, len(lights), len(o.pixels), 3))
-            for g, (raw, gain) in enumerate(guesses):
-                scene, camera, packed, pixels = problems[g]._setup(raw, gain, patch)
-                for h in (0, 1):
-                    first = seed + k + (h << 20)
-                    halves[g, h] = render_olat(
-                        scene, camera, packed, seed=first, pixels=pixels, **spent
-                    )
-            halves *= self.scale
-            rendered = losses.level(halves.mean(axis=(0, 1)))
-            weight = losses.weights(0.5 * (self._level[k][lights] + rendered))
-            product = (halves - o.radiance[lights] * self.scale).prod(axis=1)
-            valid = o.valid[lights][..., None]
-            squares = (product * weight * valid).sum(axis=(1, 3))
-            sums.append(_parts(squares))
-            counts.append(_parts(3.0 * valid.sum(axis=(0, 2))))
-        return np.stack(sums, axis=1), np.stack(counts)
+            scene, camera, lit, pixels = self._setup(raw, gain, patch)
+            captured = srgb(o.radiance[lights].astype(float) * self.scale)
+            squares = np.where(o.valid[lights][..., None], 1.0, np.zeros(3))
+            counts.append(_parts(squares.sum(axis=(0, 2))))
+            for h in (0, 1):
+                sampling = Sampling(spp, effort.max_depth, seed + k + (h << 20))
+                image = olat_smoothed(scene, camera, lit, sampling, pixels=pixels)
+                squares *= srgb(image * self.scale) - captured
+            sums.append(_parts(squares.sum(axis=(0, 2))))
+        return np.stack(sums), np.stack(counts)
 
     def compare(self, patch: Patch, rendered: Array) -> Comparison:
         """`rendered (k, P, 3)` beside what was captured of a patch, `(P,)` pixels."""

@@ -14,7 +14,8 @@ from appearance.inverse_rendering.lobes import paths_a_pixel, without_axis
 from appearance.inverse_rendering.loop import SHARED_LIGHTS, SHARED_VIEWS
 from appearance.inverse_rendering.memory import Sizes, memory_needed, scene_memory
 from appearance.inverse_rendering.options import InverseRenderingRequest
-from appearance.inverse_rendering.problem import direct_spp
+from appearance.inverse_rendering.pipeline import reduced_for_fit
+from appearance.inverse_rendering.problem import direct_spp, judging_spp
 from appearance.metrics.decision import FitStage
 from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
@@ -29,19 +30,19 @@ from reconstruction.report.report import resident_memory
 _PROBE_PIXELS, _PROBE_SPP, _PROBE_LIGHTS = 400, 16, 4
 _PATHS = {"sun": 5e5, "shared": 87.0, "correctives": 5e5, "field": 3e5}
 """Paths of the stages whatever the size, in paths of the probe; of shared for each of a patch's."""
-_SUN_PATH, _CELL_PATH, _TURN_PATH, _LOBE_PATH = 19.0, 36.0, 1.4, 5.5
+_SUN_PATH, _CELL_PATH, _TURN_PATH, _LOBE_PATH = 19.0, 24.0, 1.4, 5.5
 """Further ones: of sun for each colour path of an observed pixel (9 renderings, each path twice the
-probe's), of spatial for each path of a round (18 of them), of correctives for each cached path and
+probe's), of spatial for each path of a round (12 of them), of correctives for each cached path and
 light, and of each coarse path for the axes of lights, where none is determined."""
 _LIBRARIES_GB = 0.15
 """Of LLVM, which the first rendering loads."""
 _SUN_BYTES = 100
 """Of a pixel under a light: copies of frames, and three renderings at once."""
-_FIELD_PIXEL, _FIELD_DIRECT, _FIELD_INDIRECT = 35.0, 1.2, 0.044
-"""Of a field for each fitted pixel, and for each rendered pixel and light: direct light, and each
-path of indirect light."""
-_JUDGED = 1 << 20
-"""Paths of the held-out frames of a guess."""
+_FIELD_PIXEL, _DIRECT, _INDIRECT = 35.0, 1.2, 0.044
+"""Of a field for each fitted pixel, and for each pixel and light of rendered images: direct light,
+and each path of indirect light."""
+_JUDGED = 2
+"""Images of a held-out frame for each guess; the first stage has two guesses."""
 _SAMPLES = 10_000
 """Pixels of an image for the share of it that shows the subject."""
 
@@ -80,7 +81,11 @@ def estimate_fit(
     pixels, observed = ([min(n, x) for n in hair] for x in (request.hair_pixels, sun.hair_pixels))
     fitted = len(components(lightings[: request.lights + request.validation_lights])[0])
     of_patches = min(SHARED_VIEWS, views) * min(SHARED_LIGHTS, fitted)
-    judged = min(_JUDGED, 16 * effort.spp * sum(pixels))
+    small = reduced_for_fit(training, model, request.hair_pixels)
+    judging = [round(share * c.width * c.height) for c in small.rig.cameras]
+    held = min(request.validation_lights, fitted // 4)
+    a_pixel = _DIRECT + _INDIRECT * judging_spp(sum(pixels), effort)
+    judged = _JUDGED * a_pixel * (sum(judging) * held + max(judging) * (fitted - held))
     shared = _PATHS["shared"] * of_patches * effort.pixels * effort.spp / SHARED_LIGHTS + judged
     cells = sum(pixels) * np.clip(1e5 // max(sum(pixels), 1), 1, max(effort.spp // 4, 1))
     cached = sum(pixels) * direct_spp(sum(pixels)) * min(fitted, request.lights)
@@ -89,14 +94,14 @@ def estimate_fit(
     of_field, many = [min(n, most) for n in hair], min(lights, most_lights)
     paths = {
         "sun": _PATHS["sun"] + _SUN_PATH * sun.colour_spp * sum(observed),
-        "shared": shared,
-        "spatial": shared + _CELL_PATH * cells,
+        "shared": shared + judged,
+        "spatial": _CELL_PATH * cells + judged,
         "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
         "lights": shared + _LOBE_PATH * lobes * any(map(without_axis, lightings)),
         # every pixel of the subject is rendered, for what is smooth
         "field": _PATHS["field"]
         + _FIELD_PIXEL * sum(of_field)
-        + sum(shown) * many * (_FIELD_DIRECT + _FIELD_INDIRECT * field.spp),
+        + sum(shown) * many * (_DIRECT + _INDIRECT * field.spp),
     }
     points = len(strands.points)
     frames = max(map(frames_memory, training.rig.cameras, shown, [many] * len(shown)))

@@ -28,8 +28,9 @@ from appearance.render.paths import Surface, pixel_indices
 from appearance.render.pixel_field import field_of
 from appearance.render.tracing import LANE_BYTES, Sampling
 from appearance.scene.hair_scene import HairScene
-from reconstruction import Camera, Light
+from reconstruction import Camera
 from reconstruction.arrays import AnyFloats, Floats, Ints
+from reconstruction.geometry.lights import Lighting, components, mixed
 
 SIGMA = 1.25
 """Standard deviation, pixels, of the filter of indirect light."""
@@ -51,7 +52,7 @@ SHOWN = Sampling(36, 16)
 def olat_smoothed(
     scene: HairScene,
     camera: Camera,
-    lights: Sequence[Light],
+    lights: Sequence[Lighting],
     sampling: Sampling = SHOWN,
     *,
     pixels: ArrayLike | None = None,
@@ -63,6 +64,7 @@ def olat_smoothed(
     `DIRECT_OF_MEANS`, of direct light (`render_direct`).
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
+    lights, mix = components(lights)
     share = coverage(scene, camera, max(spp, 16), seed)
     field_on, scene = scene, replace(scene, field=None)  # what is smooth is the material's
     sees = (share["hair"] + share["head"]).ravel() > 0
@@ -84,6 +86,7 @@ def olat_smoothed(
     field = field_of(field_on, camera, wanted)
     if field is not None:
         out = field.lit(out, lights)
+    out = mixed(mix, out)
     return out if pixels is not None else spread_out(out, wanted, camera)
 
 

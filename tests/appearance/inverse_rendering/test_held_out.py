@@ -50,12 +50,24 @@ def test_the_errors_of_the_truth_are_zero_without_the_noise_of_few_paths(tufted)
     problem = tufted.problem(spp=4096)
     truth, effort = encode(HairMaps.of(tufted.truth)), Effort(spp=4, max_depth=6)
     gain, used = np.ones(8), np.ones((2, 8), bool)
-    (right, bright), counts = problem.squares(
-        [(truth, gain), (truth, 1.5 * gain)], used, effort, seed=3
-    )
+    right, counts = problem.squares(truth, gain, used, effort, seed=3)
+    bright, _ = problem.squares(truth, 1.5 * gain, used, effort, seed=3)
     assert right.shape == counts.shape == (2, 9)
     assert counts.sum() == 3 * sum(o.valid.sum() for o in problem.views)
     assert abs(right.sum()) < 0.1 * bright.sum()
+
+
+def test_errors_are_those_of_pictures_as_they_are_shown(plain, tufted):
+    """Ten times brighter highlights look the same, and a screen's error has 1 at most."""
+    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.ones((2, 8), bool)
+    brighter = plain.part(np.arange(2), np.arange(8))
+    for o in brighter.views:
+        o.radiance[o.radiance * plain.scale > 1] *= 10
+    found = [
+        p.squares(*guess, used, Effort(spp=16, max_depth=6), seed=3) for p in (plain, brighter)
+    ]
+    np.testing.assert_array_equal(found[0], found[1])
+    assert 0 < found[0][0].sum() / found[0][1].sum() < 0.2**2
 
 
 def test_saturated_pixels_do_not_count(plain, tufted):
@@ -64,6 +76,6 @@ def test_saturated_pixels_do_not_count(plain, tufted):
     for o in cut.views:
         o.valid[:, ::2] = False
         o.radiance[:, ::2] = 1e9
-    (squares,), counts = cut.squares([guess], used, Effort(spp=16, max_depth=6), seed=3)
+    squares, counts = cut.squares(*guess, used, Effort(spp=16, max_depth=6), seed=3)
     assert counts.sum() == 3 * sum(o.valid.sum() for o in cut.views)
     assert squares.sum() < counts.sum()

@@ -117,6 +117,18 @@ def test_killed_fit_resumes_and_writes_maps_lights_and_figures(made):
     assert stages["inverse_rendering"]["kept"] == result["kept"]
 
 
+@pytest.mark.parametrize(
+    ("given", "fitted", "by"),
+    [(1, 1000, 1), (1, 6, 2), (1, 2, 3), (1, 1, 5), (2, 1000, 2), (2, 1, 4)],
+)
+def test_fine_pixels_are_averaged_to_four_for_each_fitted_one(made, given, fitted, by):
+    """Images of 20 x 20, the largest with 109 pixels of hair."""
+    capture, model = made
+    view = pipeline.reduced_for_fit(capture.view(reduced=given), model, fitted)
+    assert view.reduced_by == by
+    assert {(c.width, c.height) for c in view.rig.cameras} == {(20 // by, 20 // by)}
+
+
 def test_where_no_stage_is_kept_suns_fit_is_rendered(made, tmp_path, monkeypatch):
     """White hair, offered for the brown of the frames, where Sun's fit is grey."""
     capture, model = made
