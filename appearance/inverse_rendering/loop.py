@@ -234,12 +234,14 @@ class _Fit:
         return found.raw, gain, {}
 
     def _lights(self, raw: Raw, gain: Array, progress: Progress) -> Any:
-        names = [*self.colour, "gain"]
+        names, left_open = [*self.colour, "gain"], dict[str, float]()
         if not any(map(without_axis, self.training.lights)):
-            return self._shared(raw, gain, progress, names)
+            raw, gain, left_open = self._shared(raw, gain, progress, names)
+            if decode(raw).shape != (1, 1, 1):  # of another roughness
+                raw = self._spatial(raw, gain, progress)[0]
+            return raw, gain, left_open
         pairs = _pairs(self.split.fitted & ~self.split.left_out)
         lobes, start = as_calibrated(len(gain)), gain
-        left_open: dict[str, float] = {}
         for k in range(LOBE_ROUNDS):
             found, factors = self._solve_lobes(self.training, raw, pairs, k)
             gain = start.copy()

@@ -88,6 +88,8 @@ def estimate_fit(
     judged = _JUDGED * a_pixel * (sum(judging) * held + max(judging) * (fitted - held))
     shared = _PATHS["shared"] * of_patches * effort.pixels * effort.spp / SHARED_LIGHTS + judged
     cells = sum(pixels) * np.clip(1e5 // max(sum(pixels), 1), 1, max(effort.spp // 4, 1))
+    of_cells = _CELL_PATH * cells
+    turned = any(map(without_axis, lightings))
     cached = sum(pixels) * direct_spp(sum(pixels)) * min(fitted, request.lights)
     lobes = sum(pixels) * 2 * (paths_a_pixel(sum(pixels), effort) // 8)
     most_lights, most = field.resolved(views, len(strands))
@@ -95,9 +97,9 @@ def estimate_fit(
     paths = {
         "sun": _PATHS["sun"] + _SUN_PATH * sun.colour_spp * sum(observed),
         "shared": shared + judged,
-        "spatial": _CELL_PATH * cells + judged,
+        "spatial": of_cells + judged,
         "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
-        "lights": shared + _LOBE_PATH * lobes * any(map(without_axis, lightings)),
+        "lights": shared + (_LOBE_PATH * lobes if turned else of_cells * ("spatial" in stages)),
         # every pixel of the subject is rendered, for what is smooth
         "field": _PATHS["field"]
         + _FIELD_PIXEL * sum(of_field)
