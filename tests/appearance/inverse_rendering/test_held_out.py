@@ -59,7 +59,7 @@ def test_the_errors_of_the_truth_are_zero_without_the_noise_of_few_paths(tufted)
 
 def test_errors_are_those_of_pictures_as_they_are_shown(plain, tufted):
     """Ten times brighter highlights look the same, and a screen's error has 1 at most."""
-    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.ones((2, 8), bool)
+    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.eye(2, 8, dtype=bool)
     brighter = plain.part(np.arange(2), np.arange(8))
     for o in brighter.views:
         o.radiance[o.radiance * plain.scale > 1] *= 10
