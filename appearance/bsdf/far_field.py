@@ -38,6 +38,7 @@ COSINES, TURNS = 64, 256
 """Nodes of the azimuthal part of a `FarField`, linear in between over turns."""
 SLOPES, INCLINATIONS = 1024, 256
 """Nodes of its longitudinal part by inclination of wi and wo, linear in between over wo's."""
+_SLICES = 16
 PARTS = 4
 """Of the width of a `FarField`, which each have a mean of their own."""
 LEAST_BETA_M, LEAST_BETA_N = 0.15, 0.1
@@ -107,7 +108,12 @@ def _tables(hair: HairAppearance) -> tuple[Array, Array]:
     """Both parts, flat: a second of work, for the same hair in view after view."""
     cosines = (np.arange(COSINES) + 0.5) / COSINES
     turns = np.linspace(0, pi, TURNS + 1)
-    table = azimuthal_table(hair, cosines, turns, OFFSETS // 2, PARTS)
+    # a few cosines at a time: all together take 300 MB
+    few = [
+        azimuthal_table(hair, x, turns, OFFSETS // 2, PARTS)
+        for x in np.array_split(cosines, _SLICES)
+    ]
+    table = np.concatenate(few, axis=2)
     theta_i = pi * ((np.arange(SLOPES) + 0.5) / SLOPES - 0.5)
     theta_o = np.linspace(-pi / 2, pi / 2, INCLINATIONS + 1)
     tilt = np.deg2rad(hair.tilt_deg)

@@ -234,10 +234,12 @@ class _Fit:
         return found.raw, gain, {}
 
     def _lights(self, raw: Raw, gain: Array, progress: Progress) -> Any:
-        names, left_open = [*self.colour, "gain"], dict[str, float]()
+        names = [*self.colour, "gain"]
+        left_open: dict[str, float] = {}
         if not any(map(without_axis, self.training.lights)):
             raw, gain, left_open = self._shared(raw, gain, progress, names)
-            if decode(raw).shape != (1, 1, 1):  # of another roughness
+            if np.ptp(raw["sigma_a"], axis=(0, 1, 2)).any():
+                # cells that were fitted with another roughness
                 raw = self._spatial(raw, gain, progress)[0]
             return raw, gain, left_open
         pairs = _pairs(self.split.fitted & ~self.split.left_out)

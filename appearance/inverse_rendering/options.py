@@ -41,8 +41,9 @@ class InverseRenderingRequest:
     """The options of a job.
 
     Of the training lights `lights` are fitted and at most `validation_lights`, with a camera of
-    four or more, decide which stages are kept. `hair_pixels` a camera are fitted. `max_depth` is
-    the largest number of vertices; None measures it.
+    four or more, decide which stages are kept. `hair_pixels` a camera are fitted, of images
+    downsampled while hair has four times as many. `max_depth` is the largest number of vertices;
+    None measures it.
     """
 
     lights: Count = 12

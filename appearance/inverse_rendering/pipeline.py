@@ -31,7 +31,7 @@ MOST_DEPTH = 16
 FLAT = 0.7
 """Standard error over the prior's width above which the response is flat: of its square, half."""
 _SHOWN = 4
-"""Hair pixels of an image for each one that is fitted."""
+"""Hair pixels of an image for each one that is fitted, at least."""
 FROM_SUN = 1.15
 """Ratio to Sun's roughness, or its inverse, above which a fitted roughness is doubtful."""
 BLACKER = 3.0
@@ -204,9 +204,9 @@ def _check_memory(
 
 
 def reduced_for_fit(training: Capture, model: Model, pixels: int) -> Capture:
-    """`training` with the means of so many pixels that hair has about `_SHOWN` times `pixels`.
+    """`training`, downsampled while hair covers `_SHOWN * pixels` pixels of the largest image.
 
-    Frames that decide are rendered whole, and strands are off by more than a fine pixel.
+    The frames that decide are rendered whole, and strands are off by more than a fine pixel.
     """
     most = max(int(model.mask(c.name, "hair", training).sum()) for c in training.rig.cameras)
     by = int((most / (_SHOWN * pixels)) ** 0.5)

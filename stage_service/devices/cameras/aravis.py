@@ -26,7 +26,7 @@ _LISTING = threading.Lock()
 class AravisCamera(GenicamCamera):
     """Implements the hooks of `GenicamCamera` on Aravis."""
 
-    library = "Aravis"
+    sdk = "Aravis"
     maker = "GenICam"
 
     def __init__(self, config: GenicamConfig, geometry: Camera) -> None:

@@ -15,7 +15,7 @@ from stage_service.devices.errors import DeviceTimeout, DeviceUnreachable
 class BaslerCamera(GenicamCamera):
     """Implements the hooks of `GenicamCamera` on pylon."""
 
-    library = "pylon"
+    sdk = "pylon"
     maker = "Basler"
 
     def __init__(self, config: GenicamConfig, geometry: Camera) -> None:

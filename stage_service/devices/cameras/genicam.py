@@ -67,10 +67,10 @@ class RawFrame:
 
 class GenicamCamera(ABC):
     """Implements `CameraDevice`; see there for the contract. `capabilities.timestamps` is known
-    after `connect`; `library` and `maker` are names in errors.
+    after `connect`; `sdk` and `maker` are names in errors.
     """
 
-    library: str
+    sdk: str
     maker: str
 
     def __init__(self, config: GenicamConfig, geometry: Camera) -> None:
@@ -259,7 +259,7 @@ class GenicamCamera(ABC):
             if self._camera is not None and self._removed():
                 raise self._gone(doing) from error
             todo = "Check power and cable, and that no other program holds the camera."
-            expected = f"success of {self.library}"
+            expected = f"success of {self.sdk}"
             raise self._error(doing, expected, str(error), todo) from error
 
     def _gone(self, doing: str) -> DeviceUnreachable:

@@ -46,15 +46,19 @@ def test_no_frame_is_both_fitted_and_held_out(views, lights, held, counts):
 
 
 @pytest.mark.slow
-def test_the_errors_of_the_truth_are_zero_without_the_noise_of_few_paths(tufted):
+@pytest.mark.parametrize(("spp", "most"), [(4, 0.06), (64, 0.04)])
+def test_the_error_of_the_truth_is_that_of_smoothing_and_the_least(tufted, spp, most):
+    """Hair of ten pixels' width, over which smoothing shows: 0.046 and 0.033 are measured."""
     problem = tufted.problem(spp=4096)
-    truth, effort = encode(HairMaps.of(tufted.truth)), Effort(spp=4, max_depth=6)
-    gain, used = np.ones(8), np.ones((2, 8), bool)
-    right, counts = problem.squares(truth, gain, used, effort, seed=3)
-    bright, _ = problem.squares(truth, 1.5 * gain, used, effort, seed=3)
-    assert right.shape == counts.shape == (2, 9)
-    assert counts.sum() == 3 * sum(o.valid.sum() for o in problem.views)
-    assert abs(right.sum()) < 0.1 * bright.sum()
+    truth, effort = encode(HairMaps.of(tufted.truth)), Effort(spp=spp, max_depth=6)
+    used, error = np.ones((2, 8), bool), []
+    for gain in (1.0, 1.1, 1.5):
+        squares, counts = problem.squares(truth, np.full(8, gain), used, effort, seed=3)
+        assert squares.shape == counts.shape == (2, 9)
+        assert counts.sum() == 3 * sum(o.valid.sum() for o in problem.views)
+        error.append((squares.sum() / counts.sum()) ** 0.5)
+    assert error == sorted(error)
+    assert error[0] < most < error[2]
 
 
 def test_errors_are_those_of_pictures_as_they_are_shown(plain, tufted):
@@ -67,15 +71,19 @@ def test_errors_are_those_of_pictures_as_they_are_shown(plain, tufted):
         p.squares(*guess, used, Effort(spp=16, max_depth=6), seed=3) for p in (plain, brighter)
     ]
     np.testing.assert_array_equal(found[0], found[1])
-    assert 0 < found[0][0].sum() / found[0][1].sum() < 0.2**2
+    assert abs(found[0][0].sum() / found[0][1].sum()) < 0.06**2
 
 
 def test_saturated_pixels_do_not_count(plain, tufted):
-    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.ones((2, 8), bool)
-    cut = plain.part(np.arange(2), np.arange(8))
-    for o in cut.views:
-        o.valid[:, ::2] = False
-        o.radiance[:, ::2] = 1e9
-    squares, counts = cut.squares(*guess, used, Effort(spp=16, max_depth=6), seed=3)
-    assert counts.sum() == 3 * sum(o.valid.sum() for o in cut.views)
-    assert squares.sum() < counts.sum()
+    guess, used = (encode(HairMaps.of(tufted.truth)), np.ones(8)), np.eye(2, 8, dtype=bool)
+    found = []
+    for value in (0.0, 1e9):
+        cut = plain.part(np.arange(2), np.arange(8))
+        for o in cut.views:
+            o.valid[:, ::2] = False
+            o.radiance[:, ::2] = value
+        found.append(cut.squares(*guess, used, Effort(spp=16, max_depth=6), seed=3))
+        assert (
+            found[-1][1].sum() == 3 * cut.views[0].valid[0].sum() + 3 * cut.views[1].valid[1].sum()
+        )
+    np.testing.assert_array_equal(found[0], found[1])

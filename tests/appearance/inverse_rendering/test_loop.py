@@ -61,6 +61,19 @@ def test_maps_are_kept_where_the_hair_has_two_colours(tufted, options):
     assert dark > 3 * light
 
 
+@pytest.mark.parametrize("varies", [False, True])
+def test_lights_refit_absorption_that_varies_and_no_other(plain, options, monkeypatch, varies):
+    """Cells of one absorption are there after the correctives, too."""
+    maps, calls = START.resized((2, 2, 2)), []
+    maps.sigma_a[0] *= 1 + varies
+    fit = loop._Fit(plain, options, 2, 0)
+    monkeypatch.setattr(loop, "without_axis", lambda light: False)
+    monkeypatch.setattr(fit, "_shared", lambda raw, gain, *_: (raw, gain, {}))
+    monkeypatch.setattr(loop, "absorption_of_cells", lambda *_, **__: calls.append(1) or maps)
+    fit._lights(encode(maps), np.ones(8), lambda *_: None)
+    assert len(calls) == varies
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("killed_in", ["absorption_of_cells", "solve_correctives"])
 def test_an_interrupted_fit_does_not_begin_again(plain, options, tmp_path, monkeypatch, killed_in):

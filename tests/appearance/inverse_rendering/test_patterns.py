@@ -12,6 +12,8 @@ from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering.linearised import LinearisedPictures
 from appearance.render.cached_paths import CachedSampling, WeightedPixels, cache_paths
 from appearance.render.olat import render_indirect
+from appearance.render.smoothed import olat_smoothed
+from appearance.render.tracing import Sampling
 from appearance.scene.hair_scene import light_arrays
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from appearance.sun_fit.options import FitOptions
@@ -43,6 +45,18 @@ def test_a_rendering_under_a_pattern_is_the_weighted_sum(tufted, plain, render):
     weights = WEIGHTS[:, [int(n[1:]) for n in order]]
     np.testing.assert_allclose(one[:2], np.tensordot(weights, singles, 1), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(one[2], singles[order.index("l2")], rtol=1e-5, atol=1e-7)
+
+
+def test_a_smoothed_rendering_under_a_pattern_is_the_weighted_sum(tufted, plain):
+    o = plain.views[0]
+    scene = tufted.mapped.with_maps(HairMaps.of(tufted.truth))
+    patterns = patterns_of(plain.lights)
+    singles, mix = components(patterns)
+    one, each = (
+        olat_smoothed(scene, o.camera, x, Sampling(4, 4), pixels=o.pixels)
+        for x in (patterns, singles)
+    )
+    np.testing.assert_allclose(one, np.tensordot(mix, each, 1), rtol=1e-4, atol=1e-6)
 
 
 def test_derivatives_under_patterns_are_the_weighted_sums(tufted, plain):

@@ -121,7 +121,7 @@ def test_killed_fit_resumes_and_writes_maps_lights_and_figures(made):
     ("given", "fitted", "by"),
     [(1, 1000, 1), (1, 6, 2), (1, 2, 3), (1, 1, 5), (2, 1000, 2), (2, 1, 4)],
 )
-def test_fine_pixels_are_averaged_to_four_for_each_fitted_one(made, given, fitted, by):
+def test_images_are_downsampled_to_four_hair_pixels_for_each_fitted_one(made, given, fitted, by):
     """Images of 20 x 20, the largest with 109 pixels of hair."""
     capture, model = made
     view = pipeline.reduced_for_fit(capture.view(reduced=given), model, fitted)
