@@ -16,6 +16,7 @@ from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
 from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
+from reconstruction.growth.thickness import covering_radii
 from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.light_codes.line_strands import roots_first
@@ -24,9 +25,6 @@ from reconstruction.plausibility import check_face, check_inside, check_strands
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
-
-HEAD_OF_HAIR = 100_000 * 40e-6
-"""Metres of fibre radius on a head: 100,000 fibres of 40 µm (Photobooth §3.4)."""
 
 SPACING = 2e-3  # metres between a written strand's points
 
@@ -174,7 +172,6 @@ class GrowingStages(Stages):
                 stage.leave_out("roots", why, "this stage; strands begin at their higher end")
                 self.unrooted(strands, measured, stage)
                 return
-            strands = replace(strands, radius=self._radius(len(strands)))
             self._write(strands, measured, stage, scalp.area)
             check_face(strands, scalp.head, stage)
             check_inside(strands, scalp.head, stage)
@@ -184,23 +181,20 @@ class GrowingStages(Stages):
         """Write strands without roots; raises `CaptureError` without strands."""
         if not len(strands):
             raise CaptureError("no strand was found: use the method 'hull', which fills the masks")
-        self._write(replace(strands, radius=self._radius(len(strands))), measured, stage)
+        self._write(strands, measured, stage)
 
     def _write(
         self, strands: Strands, measured: Measured, stage: Stage, area: float | None = None
     ) -> None:
-        """Write strands, each point with its confidence by the `measured` lines."""
+        """Write strands, each point with its radius, and its confidence by the `measured` lines."""
+        strands = replace(strands, radius=self.options.radius or covering_radii(strands))
         lines = measured.where(measured.confidence >= LEAST_CONFIDENCE)
         confidence = supported(strands, lines)
         stage.figures.update(
             strands=len(strands),
             metres=float(strands.lengths().sum()),
-            radius=strands.radius,
+            radius=float(np.median(strands.radius)),
             measured_share=float((confidence > 0).mean()),
         )
         check_strands(strands, area, stage)
         self.model.write_strands(replace(strands, confidence=confidence))
-
-    def _radius(self, count: int) -> float:
-        """Metres: the option's, or the one that keeps a head of hair's coverage."""
-        return self.options.radius or float(np.clip(HEAD_OF_HAIR / max(count, 1), 4e-5, 4e-4))

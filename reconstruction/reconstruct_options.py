@@ -113,8 +113,9 @@ class ReconstructOptions:
     `scalp_points` is a file of digitised scalp points to fit a head to, `head_mesh` (OBJ) the head
     to fit instead of the generic one. Gaps are filled `within` metres of a measurement (None: 3 mm
     or two voxels, on a hull 12 mm); give more for wider pixels.
-    `radius` of the strands; None keeps a head of hair's coverage. `frame` is that of the written
-    strands and head: of the user's cameras, for an imported capture, or the stage's.
+    `radius` of the strands; None covers as much as a head of hair, less where strands are dense.
+    `frame` is that of the written strands and head: of the user's cameras, for an imported capture,
+    or the stage's.
     """
 
     held_out: tuple[str, ...] = ()
