@@ -188,9 +188,25 @@ def _material(model: Model) -> Iterator[tuple[str, list[str]]]:
     yield "colour", [*text, "" if known else ", error unknown"]
     yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
     if _by_inverse_rendering(model):
-        yield "rendered", ["inverse rendering, which started from the roughness and colour above"]
+        yield "rendered", ["inverse rendering, starting from these: ", *_rendered(model)]
     if model.has(FIELD_FILE):
         yield "field", [link(FIELD_FILE), ": reflectance that the material lacks, also rendered"]
+
+
+def _rendered(model: Model) -> list[str]:
+    """Roughness and colours, from root to tip, of the maps."""
+    from appearance.bsdf.longitudinal import colour_of_absorption
+
+    maps = model.arrays("hair_maps.npz")
+    beta_m, beta_n = (float(x) for x in maps["scalars"][:2])
+    layers = maps["sigma_a"].mean(axis=(1, 2))  # of all cells of the scalp
+    names = ("root", "middle", "tip") if len(layers) > 1 else ("colour",)
+    out: list[str] = [element("b", f"β_M {beta_m:.2f}")]
+    for k, name in enumerate(names):
+        layer = layers[k * (len(layers) - 1) // 2]
+        out += [f"; {name} ", _swatch(colour_of_absorption(layer, beta_n).tolist()), "σ_a "]
+        out.append(", ".join(f"{x:.2g}" for x in layer))
+    return out
 
 
 def _swatch(linear: Sequence[float]) -> Html:

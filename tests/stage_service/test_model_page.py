@@ -138,10 +138,15 @@ def test_rendered_and_missing_fits_are_listed_separately(model):
     with report.stage("inverse_rendering"):
         pass
     model.write_report(report)
-    for name in ("hair_maps.npz", "field.npz"):
-        model.write_arrays(name, {"a": np.zeros(1)})
+    sigma = np.ones((3, 2, 2, 3)) * np.array([0.1, 0.2, 0.4])[:, None, None, None]
+    sigma[2, ..., 0] = 0.8, 1.6  # a mean over the scalp of 1.2
+    model.write_arrays("hair_maps.npz", {"sigma_a": sigma, "scalars": np.array([0.33, 0.3, 1.55])})
+    model.write_arrays("field.npz", {"a": np.zeros(1)})
     assert "not used" not in (text := Page(model_page(model)).text)
     assert "rendered inverse rendering" in text.replace("renderedinverse", "rendered inverse")
+    assert (
+        "β_M 0.33; root σ_a 0.1, 0.1, 0.1; middle σ_a 0.2, 0.2, 0.2; tip σ_a 1.2, 0.4, 0.4" in text
+    )
     assert "reflectance that the material lacks" in text
     model.remove("hair_maps.npz")
     text = Page(model_page(model)).text
