@@ -255,7 +255,7 @@ def add_subject(parser: argparse.ArgumentParser) -> None:
     """Add the options of rig and subject."""
     parser.add_argument("--rig", type=rig_path, default="demo", help=RIG_HELP)
     names = ", ".join(SUBJECTS)
-    parser.add_argument("--subject", default="wavy", help=f"{names} or a strand file")
+    parser.add_argument("--subject", default="wavy-mixed", help=f"{names} or a strand file")
     parser.add_argument("--head", type=Path, help="head mesh (.obj) for a strand file")
     parser.add_argument("--seed", type=int, default=0)
 

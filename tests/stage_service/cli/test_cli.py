@@ -201,7 +201,7 @@ def test_bad_input_is_exit_code_3_and_named(capsys, tmp_path):
     [
         (("--seed", "-1"), "--seed -1: expected 0 or more"),
         (("--subject", "curlyy"), "--subject curlyy: "),
-        (("--head", "none.obj"), "wavy brings its own"),
+        (("--head", "none.obj"), "wavy-mixed brings its own"),
         (("--environment", "nosuch"), "nosuch: no such environment map"),
         (("--subject", "{tmp}/broken.npz", "--head", "none.obj"), "broken.npz"),
     ],
