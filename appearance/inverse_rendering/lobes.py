@@ -108,12 +108,25 @@ def determined(problem: FitProblem, lobes: Array, gain: Array) -> tuple[Array, A
     """`lobes (L, 6)` without axis and power where the axis' error is above `DETERMINED`, and
     `gain (L,)` with what those lobes send towards the hair's centre."""
     lobes, gain = lobes.copy(), gain.copy()
-    for i in np.flatnonzero(np.isfinite(lobes[:, 3]) & ~(lobes[:, 4] < DETERMINED)):
-        ahead = problem.centre - problem.lights[i].position
-        cosine = ahead @ lobes[i, :3] / np.linalg.norm(ahead)
-        gain[i] *= max(cosine, 0.0) ** lobes[i, 3]
-        lobes[i, :4] = np.nan
+    vague = np.isfinite(lobes[:, 3]) & ~(lobes[:, 4] < DETERMINED)
+    gain[vague] *= towards_hair(problem, lobes)[vague]
+    lobes[vague, :4] = np.nan
     return lobes, gain
+
+
+def towards_hair(problem: FitProblem, lobes: Array) -> Array:
+    """Share `(L,)` of its light on the axis that each of `lobes (L, 6)` sends to the hair's centre;
+    1 as calibrated."""
+    ahead = problem.centre - np.array([x.position for x in problem.lights])
+    cosine = (ahead * lobes[:, :3]).sum(axis=1) / np.linalg.norm(ahead, axis=1)
+    return np.where(np.isfinite(lobes[:, 3]), np.maximum(cosine, 0.0) ** lobes[:, 3], 1.0)
+
+
+def mean_level(problem: FitProblem, lobes: Array, gain: Array) -> float:
+    """Geometric mean of what lights with `lobes (L, 6)` and factors `gain (L,)` send to the hair's
+    centre, over what they send as calibrated: the best guess for a light that was not fitted."""
+    level = np.maximum(gain * towards_hair(problem, lobes), 1e-3)
+    return float(np.exp(np.log(level).mean()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from appearance.inverse_rendering.initial_absorption import absorption_of_cells
 from appearance.inverse_rendering.lobes import (
     as_calibrated,
     determined,
+    mean_level,
     solve_lobes,
     with_lobes,
     without_axis,
@@ -31,7 +32,7 @@ from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import Raw, decode, encode
 from appearance.metrics.decision import MATERIAL, Decision, Material, decide
 from reconstruction import Progress, silent
-from reconstruction.arrays import Array, Bools
+from reconstruction.arrays import Array, Bools, Ints
 from reconstruction.geometry.lights import LightPattern
 
 SHARED_VIEWS, SHARED_LIGHTS = 3, 8
@@ -142,13 +143,17 @@ class _Fit:
         raw, gain, left_open, *lobes = self._solvers[stage](state.raw, state.gain, progress)
         progress("rendering held-out frames", 0.9)
         state.lobes = lobes[0] if lobes else state.lobes
-        lit, frames = self.problem, self.split.held_out
+        lit, frames, shown = self.problem, self.split.held_out, gain
         turned = bool(lobes) and bool(np.isfinite(lobes[0][:, 3]).any())
-        if turned:  # the lights that are held out have no lobes yet
+        if turned:
             lit = self.problem.under(with_lobes(self.problem.lights, lobes[0]))
-            self._judged, frames = None, self.split.frames_of_fitted()
+            self._judged, frames = None, frames | self.split.frames_of_fitted()
+            own = (gain / state.gain)[self.lights]
+            level = mean_level(self.training, lobes[0][self.lights], own)
+            shown = gain.copy()
+            shown[self._held_lights] *= level
         before = self._judged or self._squares(self.problem, state.raw, state.gain, frames)
-        after = self._squares(lit, raw, gain, frames)
+        after = self._squares(lit, raw, shown, frames)
         decision = decide(stage, before[0], after[0], before[1], time.perf_counter() - begun)
         state.decisions.append(decision)
         if not turned:
@@ -157,7 +162,7 @@ class _Fit:
             state.raw, state.gain = raw, gain
             state.left_open = left_open or state.left_open
             if turned:
-                self._add_lobes_of_held_out(state)
+                self._add_lobes_of_held_out(state, level)
         elif state.lobes is not None:
             state.lobes[:, :4] = np.nan
 
@@ -261,16 +266,22 @@ class _Fit:
         options, seed = self.options, (self.seed << 4) + k
         return solve_lobes(problem, raw, pairs, options.effort, seed, options.light_power)
 
-    def _add_lobes_of_held_out(self, state: State) -> None:
-        """Those of the lights that were held out, on the hair that was kept."""
+    def _add_lobes_of_held_out(self, state: State, level: float) -> None:
+        """Those of the lights that were held out, on the hair that was kept; a factor of `level`
+        where none is found."""
         assert state.lobes is not None
-        rest = np.delete(np.arange(len(self.problem.lights)), self.lights)
+        rest = self._held_lights
         lit = lit_pairs(self.problem.views, self.problem.scale)
         lit[:, self.lights] = False
         found = self._solve_lobes(self.problem, state.raw, _pairs(lit), 7)
         lobes, factors = determined(self.problem, *found)
         state.lobes[rest], state.gain = lobes[rest], state.gain.copy()
-        state.gain[rest] *= factors[rest]
+        solved = np.isfinite(found[0][rest, 3])
+        state.gain[rest] *= np.where(solved, factors[rest], level)
+
+    @property
+    def _held_lights(self) -> Ints:
+        return np.delete(np.arange(len(self.problem.lights)), self.lights)
 
     def _in_cells(self, raw: Raw) -> Raw:
         return encode(decode(raw).resized(self.options.shape))

@@ -11,7 +11,8 @@ import numpy as np
 from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering.fitted_lights import LIGHTS_FILE, save_lights
 from appearance.inverse_rendering.global_parameters import FOUND
-from appearance.inverse_rendering.loop import Monitor, run
+from appearance.inverse_rendering.lobes import as_calibrated, mean_level, without_axis
+from appearance.inverse_rendering.loop import Monitor, Outcome, run
 from appearance.inverse_rendering.memory import Sizes, memory_needed
 from appearance.inverse_rendering.options import InverseRenderingRequest
 from appearance.inverse_rendering.problem import FitProblem
@@ -94,8 +95,8 @@ def fit_maps(
             model.remove(earlier)
         if found.kept:
             found.maps.save(model, mapped.root_uv)
-            if singles := [x for x in problem.lights if isinstance(x, Light)]:
-                save_lights(model, found.gain, singles, found.lobes)
+            if any(isinstance(x, Light) for x in problem.lights):
+                write_fitted_lights(model, capture.rig.lights, problem, found)
             stage.warnings += _doubts(start, found.maps, bool(training.olat_lights())) + _flat(
                 found.left_open
             )
@@ -116,6 +117,23 @@ def fit_maps(
     checkpoint.unlink(missing_ok=True)
     progress("inverse rendering done", 1.0)
     return result
+
+
+def write_fitted_lights(
+    model: Model, lights: Sequence[Light], problem: FitProblem, found: Outcome
+) -> None:
+    """Write the fitted lights; if axes were found, also all other `lights` without an axis, which
+    are as bright on the hair as the fitted ones on average."""
+    singles = [x for x in problem.lights if isinstance(x, Light)]
+    gain, lobes = found.gain, found.lobes
+    if lobes is not None and np.isfinite(lobes[:, 3]).any():
+        names = {x.name for x in singles}
+        others = [x for x in lights if x.name not in names and without_axis(x)]
+        level = mean_level(problem, lobes, gain)
+        gain = np.append(gain, np.full(len(others), level))
+        lobes = np.vstack([lobes, as_calibrated(len(others))])
+        singles += others
+    save_lights(model, gain, singles, lobes)
 
 
 def _doubts(start: HairMaps, found: HairMaps, measured: bool) -> list[str]:

@@ -13,8 +13,10 @@ from appearance.bsdf.maps import HairMaps, MappedStrands, scalp_coordinates
 from appearance.inverse_rendering import loop
 from appearance.inverse_rendering.batches import Batch, Comparison
 from appearance.inverse_rendering.fitted_lights import fitted_lights, save_lights
+from appearance.inverse_rendering.held_out import Split
 from appearance.inverse_rendering.lobes import DETERMINED, determined, solve_lobes, with_lobes
 from appearance.inverse_rendering.options import Effort
+from appearance.inverse_rendering.pipeline import write_fitted_lights
 from reconstruction import Camera, Light, Model, Strands
 from reconstruction.geometry.cameras import facing
 from reconstruction.geometry.light_profiles import cosine_lobe
@@ -170,6 +172,23 @@ def test_lights_json_holds_axis_and_power(tmp_path):
     assert "power" not in rows[2]
 
 
+def test_lights_that_were_not_fitted_are_as_bright_as_the_mean_of_those_with_axes(tmp_path):
+    """Fitted lights send gain · cos(angle)^power to the hair: their geometric mean."""
+    lights, model = lamps(4, 2.0, aside=(0.0, 60.0)), Model(tmp_path).create()
+    given = stripped(lights[:3]) + lights[3:]  # the calibration of the last has an axis
+    lobes = np.array([[*x.orientation[2], 2.0, 0.01, 0.1] for x in lights[:2]])
+    maps = HairMaps.of(HairAppearance((0.1, 0.2, 0.3), 0.3, 0.3))
+    found = loop.Outcome(maps, np.array([1.0, 0.5]), lobes=lobes)
+    write_fitted_lights(model, given, Matte(given[:2], lights[:2]), found)
+    read = fitted_lights(model, given)
+    level = np.sqrt(1.0 * 0.5 * np.cos(np.radians(20)) ** 2)
+    assert read[2].intensity == pytest.approx(level * lights[2].intensity)
+    assert read[2].orientation is None
+    assert read[3].intensity == pytest.approx(lights[3].intensity)
+    write_fitted_lights(model, given, Matte(given[:2], lights[:2]), replace(found, lobes=None))
+    assert fitted_lights(model, given)[2].intensity == pytest.approx(lights[2].intensity)
+
+
 def ball(count: int = 4000) -> Strands:
     """A head of hair, 21 cm across."""
     rng = np.random.default_rng(0)
@@ -182,22 +201,49 @@ def ball(count: int = 4000) -> Strands:
     return Strands(points.reshape(-1, 3).astype(np.float32), 6 * np.arange(count + 1), radius=6e-4)
 
 
-@pytest.mark.slow
-def test_hair_under_near_lights_of_unknown_axes(tufted, observing):
-    """Colours within 3 % of what fibres transmit; 16 % with isotropic lights."""
-    lights, strands, truth = lamps(8, 1.0), ball(), tufted.truth
+OPTIONS = InverseRenderingOptions(effort=Effort(pixels=300, spp=64, max_depth=1))
+
+
+@pytest.fixture(scope="module")
+def lit_ball(tufted, observing):
+    """`lit_ball(lights)`: the problem of a ball of hair under `lights`, given as isotropic."""
+    strands, truth = ball(), tufted.truth
     scene = build_scene(strands, None, hair=truth)
     mapped = MappedStrands.of(scene, strands, scalp_coordinates(strands, None))
     angles = 0.3 + np.pi / 2 * np.arange(4)
     eyes = [(0.8 * np.cos(a), 0.8 * np.sin(a), 0.15) for a in angles]
     cameras = [Camera.look_at(f"c{i}", 32, 32, e, (0, 0, 0), 17) for i, e in enumerate(eyes)]
     shown = mapped.with_maps(HairMaps.of(truth))
-    problem = observing(mapped, shown, cameras, lights, spp=1024, depth=1).under(stripped(lights))
-    options = InverseRenderingOptions(effort=Effort(pixels=300, spp=64, max_depth=1))
+
+    def problem(lights):
+        found = observing(mapped, shown, cameras, lights, spp=1024, depth=1)
+        return found.under(stripped(lights))
+
+    return problem
+
+
+@pytest.mark.slow
+def test_axes_that_the_held_out_lights_do_not_have_are_dropped(tufted, lit_ball):
+    """Half as bright as calibrated, by their lobes, are only the lights that are fitted."""
+    lights = lamps(8, 4.0)
+    fitted = Split.of(lit_ball(lights), 2).lights
+    for i in np.delete(np.arange(8), fitted):
+        lights[i] = stripped(lights)[i]
+    found = loop.run(
+        lit_ball(lights), HairMaps.of(tufted.truth), stages=["lights"], options=OPTIONS
+    )
+    assert not found.kept
+
+
+@pytest.mark.slow
+def test_hair_under_near_lights_of_unknown_axes(tufted, lit_ball):
+    """Colours within 3 % of what fibres transmit; 16 % with isotropic lights."""
+    lights, truth = lamps(8, 1.0), tufted.truth
+    problem = lit_ball(lights)
     start = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.25, 0.35))
 
     def colour_error(stages) -> tuple[float, loop.Outcome]:
-        found = loop.run(problem, start, stages=stages, options=options)
+        found = loop.run(problem, start, stages=stages, options=OPTIONS)
         left = np.exp(-2 * found.maps.sigma_a.reshape(-1, 3).mean(0))
         return float(np.abs(left / np.exp(-2 * np.array(truth.sigma_a)) - 1).max()), found
 
