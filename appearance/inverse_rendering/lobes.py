@@ -19,7 +19,7 @@ from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
 from appearance.inverse_rendering.unknowns import Raw
 from reconstruction import Light
-from reconstruction.arrays import Array
+from reconstruction.arrays import Array, Ints
 from reconstruction.geometry.cameras import facing
 from reconstruction.geometry.light_profiles import cosine_lobe
 from reconstruction.geometry.lights import Lighting
@@ -32,12 +32,15 @@ _WIDE = np.array([1.0, 1.0, 1.0, 1.0, 0.03, 0.5, 0.5])
 """Prior standard deviations: of the hair's brightness (none), the power, and of each light its log
 intensity and the angles (radians) of its axis from the hair."""
 _MODEL = 0.01
-"""Relative error of renderings, alike over `_ALIKE` values: strands and skin are not exact."""
+"""Relative error of renderings, alike in each of `_PARTS`: strands and skin are not exact."""
 _KNOWN = 1e-6
 """Prior standard deviation of a power that is given."""
 _HALVINGS = 4
 """Of a step after which the error is twice as large: the far side of a lobe is dark."""
-_STEPS, _MOST_STEP, _ALIKE, _PATHS, _SPP = 20, 0.4, 288, 1 << 22, 16
+_PARTS = 3
+"""Of a view's pixels, in image order. Errors of the strands are alike over a large part of a view:
+single rows, taken as independent, made axes of isotropic lights significant."""
+_STEPS, _MOST_STEP, _PATHS, _SPP = 20, 0.4, 1 << 22, 16
 
 
 def as_calibrated(count: int) -> Array:
@@ -171,13 +174,14 @@ class _Lobes:
 @dataclass(frozen=True, eq=False)
 class _Images:
     """A light's N hits `points (N, 3)`, images `(N, 3)`, and two independent ones `rendered
-    (2, N, 3)` without its lobe."""
+    (2, N, 3)` without its lobe; `starts (B,)` of the `_PARTS` of its views."""
 
     points: Array
     rendered: Array
     captured: Array
     level: Array
     weight: Array
+    starts: Ints
 
 
 def _images(
@@ -216,8 +220,21 @@ def _images(
                 share = lobes.share(problem, n, points)[0] if shaped else np.ones(len(points))
                 plain = rendered[:, j] / np.maximum(share, 1e-3)[:, None]
                 parts[n].append((points, *plain, seen.captured[j], seen.level[j], weight[j]))
-    joined = [[np.concatenate(x) for x in zip(*rows, strict=True)] for rows in parts]
-    return [_Images(x[0], np.array(x[1:3]), *x[3:]) for x in joined]
+    out = []
+    for views in parts:
+        points, one, other, captured, level, weight = (
+            np.concatenate(x) for x in zip(*views, strict=True)
+        )
+        sizes = np.concatenate([_part_sizes(len(view[0])) for view in views])
+        starts = np.cumsum(sizes) - sizes
+        both = np.array([one, other])
+        out.append(_Images(points, both, captured, level, weight, starts))
+    return out
+
+
+def _part_sizes(pixels: int) -> Ints:
+    """Of at most `_PARTS` parts that are not empty."""
+    return np.array([len(x) for x in np.array_split(np.arange(pixels), _PARTS) if len(x)], int)
 
 
 def _solve(
@@ -279,7 +296,7 @@ def _step(
         matrix[np.ix_(own, own)] += left @ (by * model).reshape(7, -1).T
         moment[own] += left @ residual
         for error in (residual, _MODEL * seen.level.ravel()):
-            parts = np.add.reduceat(left * error, np.arange(0, len(error), _ALIKE), axis=1)
+            parts = np.add.reduceat(left * error, 3 * seen.starts, axis=1)
             spread[np.ix_(own, own)] += parts @ parts.T
         turns = -facing(lobes.axes[k])[:2] @ prior.axes[k]
         about[own[4:]] = np.array([lobes.log_gain[k], *turns]) / wide[own[4:]]
