@@ -45,7 +45,7 @@ def material(model: Model) -> Iterator[tuple[str, list[str]]]:
     yield "colour", [*text, "" if known else ", error unknown"]
     yield "skin", [_swatch(fit["skin"]), ", ".join(f"{x:.2f}" for x in fit["skin"])]
     if _by_inverse_rendering(model):
-        yield "rendered", ["inverse rendering, starting from these: ", *_rendered(model)]
+        yield "rendered", ["inverse rendering from the values above: ", *_rendered(model)]
     if model.has(FIELD_FILE):
         yield "field", [link(FIELD_FILE), ": reflectance that the material lacks, also rendered"]
 
@@ -53,15 +53,15 @@ def material(model: Model) -> Iterator[tuple[str, list[str]]]:
 def _rendered(model: Model) -> list[str]:
     """Roughness and colours, from root to tip, of the maps."""
     from appearance.bsdf.longitudinal import colour_of_absorption
+    from appearance.bsdf.maps import HairMaps
 
-    maps = model.arrays("hair_maps.npz")
-    beta_m, beta_n = (float(x) for x in maps["scalars"][:2])
-    layers = maps["sigma_a"].mean(axis=(1, 2))  # of all cells of the scalp
+    maps, _ = HairMaps.load(model)
+    layers = maps.sigma_a.mean(axis=(1, 2))  # of all cells of the scalp
     names = ("root", "middle", "tip") if len(layers) > 1 else ("colour",)
-    out: list[str] = [element("b", f"β_M {beta_m:.2f}")]
+    out: list[str] = [element("b", f"β_M {maps.beta_m:.2f}")]
     for k, name in enumerate(names):
         layer = layers[k * (len(layers) - 1) // 2]
-        out += [f"; {name} ", _swatch(colour_of_absorption(layer, beta_n).tolist()), "σ_a "]
+        out += [f"; {name} ", _swatch(colour_of_absorption(layer, maps.beta_n).tolist()), "σ_a "]
         out.append(", ".join(f"{x:.2g}" for x in layer))
     return out
 

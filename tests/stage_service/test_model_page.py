@@ -8,6 +8,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
+from appearance.bsdf.maps import HairMaps
 from reconstruction import Mesh, Model, Report, Strands
 from reconstruction.report.report import Series
 from stage_service.cli import main
@@ -140,7 +141,8 @@ def test_rendered_and_missing_fits_are_listed_separately(model):
     model.write_report(report)
     sigma = np.ones((3, 2, 2, 3)) * np.array([0.1, 0.2, 0.4])[:, None, None, None]
     sigma[2, ..., 0] = 0.8, 1.6  # a mean over the scalp of 1.2
-    model.write_arrays("hair_maps.npz", {"sigma_a": sigma, "scalars": np.array([0.33, 0.3, 1.55])})
+    maps = HairMaps(sigma, np.zeros((3, 2, 2, 2)), 0.33, 0.3, 1.55, 2.0)
+    maps.save(model, np.zeros((1, 2)))
     model.write_arrays("field.npz", {"a": np.zeros(1)})
     assert "not used" not in (text := Page(model_page(model)).text)
     assert "rendered inverse rendering" in text.replace("renderedinverse", "rendered inverse")

@@ -25,15 +25,15 @@ def lawn(copies: int) -> tuple[Strands, np.ndarray]:
     return Strands(points, len(rise) * np.arange(len(root) + 1)), of_dense
 
 
-@pytest.mark.parametrize("copies", [2, 4, 8])
-def test_no_half_of_a_lawn_covers_more_than_the_mean(copies: int) -> None:
+@pytest.mark.parametrize(("copies", "within"), [(2, 0.15), (4, 0.15), (8, 0.25)])
+def test_no_half_of_a_lawn_covers_more_than_the_mean(copies: int, within: float) -> None:
     """The mean density is that over the volume: (1 + copies)/2 of the sparse half's."""
     strands, dense = lawn(copies)
     radius = covering_radii(strands)
     each = min(HEAD_OF_HAIR / len(strands), THICKEST)
     assert np.median(radius[~dense]) == pytest.approx(each)
     wanted = max(each * (1 + copies) / 2 / copies, THINNEST)
-    assert np.median(radius[dense]) == pytest.approx(wanted, rel=0.25)
+    assert np.median(radius[dense]) == pytest.approx(wanted, rel=within)
 
 
 def test_strands_of_one_density_keep_a_head_of_hairs_coverage() -> None:
