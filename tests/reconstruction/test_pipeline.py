@@ -415,6 +415,30 @@ def test_hair_far_from_the_scalp_is_kept_without_roots(tmp_path: Path) -> None:
     assert stages.report["roots"].left_out
 
 
+@pytest.mark.parametrize("given", [None, 1e-4])
+def test_written_strands_are_thinner_where_they_are_dense_unless_a_radius_is_given(
+    tmp_path: Path, given: float | None
+) -> None:
+    """Strands 3 mm apart, and as many 10 cm away that are 1 mm apart."""
+    i, j = np.divmod(np.arange(400), 20)
+    grid = np.stack([i, j, 0 * i], axis=1)
+    roots = np.concatenate([3e-3 * grid, 1e-3 * grid + [0.16, 0, 0]])
+    rise = np.arange(0, 0.06, 2e-3)[:, None] * (0, 0, 1)
+    strands = Strands.from_list([root + rise for root in roots])
+    measured = Measured(roots, np.tile([0, 0, 1.0], (800, 1)), np.ones(800))
+    options = replace(QUICK, radius=given)
+    GrowingStages(Model(tmp_path).create(), options, silent, Report()).rooted(
+        strands, measured, None, None
+    )
+    radius = np.asarray(read_strands(tmp_path / "strands.npz").radius)
+    if given is not None:
+        assert radius.shape == ()
+        assert radius == pytest.approx(given)
+    else:
+        sparse, dense = radius.reshape(2, -1)
+        assert np.median(dense) < 0.5 * np.median(sparse)
+
+
 @pytest.mark.slow
 def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
