@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from appearance import HairScene
 
 
-PROCESS_GB = 0.45
+PROCESS_GB = 0.27
 """Of Python, Mitsuba and LLVM."""
 
 

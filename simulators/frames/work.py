@@ -26,7 +26,7 @@ class Cost(NamedTuple):
 
 
 COSTS = {
-    "lights": Cost(2.5, 1e-6, 6e-7, 6.0),
+    "lights": Cost(0.3, 3e-6, 4.5e-7, 3.0),
     "lights_together": Cost(0.3, 2e-6, 0.0, 1.0),
     "sweep": Cost(0.2, 6e-6, 0.0, 1.0),
 }

@@ -273,11 +273,11 @@ def report(result: dict[str, Any]) -> str:
         "β_M off",
         "β_N off",
         "most σ off",
-        "σ seen off",
+        "visible σ off",
         "CPU s",
         "GB",
     ]
-    errors = ("beta_m_error", "beta_n_error", "sigma_a_error", "sigma_a_seen_error")
+    errors = ("beta_m_error", "beta_n_error", "sigma_a_error", "visible_sigma_a_error")
     lines = []
     for name, variants in result["subjects"].items():
         cells = []

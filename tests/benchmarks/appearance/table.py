@@ -42,7 +42,7 @@ FIELDS = {"full": FieldOptions(), "GaussianHair": FieldOptions("whole", **BASELI
 """The last stage's material with a field, where the fit keeps it; a field without material."""
 
 
-def absorption_seen(maps: HairMaps, mapped: MappedStrands, view: Observed) -> Array:
+def visible_absorption(maps: HairMaps, mapped: MappedStrands, view: Observed) -> Array:
     """Mean sigma_a `(P, 3)` of what each pixel of a view shows of `mapped`; NaN without hair."""
     hits = find_hits(mapped, view.camera, view.pixels, HITS)
     grid = Grid.of(maps.shape, len(mapped.root_uv))
@@ -50,9 +50,9 @@ def absorption_seen(maps: HairMaps, mapped: MappedStrands, view: Observed) -> Ar
     table = maps.sigma_a.reshape(grid.count, 3)
     values = np.full((len(view.pixels) * hits.count, 3), np.nan)
     values[number] = table[low] * (1 - share[:, None]) + table[high] * share[:, None]
-    seen = values.reshape(len(view.pixels), hits.count, 3)
-    count = np.isfinite(seen).sum(axis=1)
-    return np.asarray(np.nansum(seen, axis=1) / np.where(count > 0, count, np.nan))
+    each = values.reshape(len(view.pixels), hits.count, 3)
+    count = np.isfinite(each).sum(axis=1)
+    return np.asarray(np.nansum(each, axis=1) / np.where(count > 0, count, np.nan))
 
 
 class Table:
@@ -128,7 +128,7 @@ class Table:
             self.variants[variant] |= {
                 "cpu_seconds": worked,
                 "memory_gb": peak.gb,
-                "memory_told_gb": held + memory_needed(sizes, self.options),
+                "memory_estimated_gb": held + memory_needed(sizes, self.options),
                 "decision": found.decisions[0].to_dict(),
                 "gain_spread": float(found.gain.std()),
             }
@@ -221,12 +221,12 @@ class Table:
         pairs = [p for k in self._judged() for p in zip(*rendered[k], strict=True)]
         self._score(variant, [(a.astype(float), b.astype(float)) for a, b in pairs])
         views = [captured.views[k] for k in self._judged()]
-        seen, true_seen = (
-            np.concatenate([absorption_seen(m, on, o) for o in views])
+        shown, true_shown = (
+            np.concatenate([visible_absorption(m, on, o) for o in views])
             for m, on in ((maps, mapped), (true, captured.true_mapped))
         )
-        both = np.isfinite(seen[:, 0] + true_seen[:, 0])
-        mean, true_mean = seen[both].mean(axis=0), true_seen[both].mean(axis=0)
+        both = np.isfinite(shown[:, 0] + true_shown[:, 0])
+        mean, true_mean = shown[both].mean(axis=0), true_shown[both].mean(axis=0)
         self.variants[variant] |= {
             "seconds": seconds,
             "sigma_a": mean.tolist(),
@@ -236,7 +236,7 @@ class Table:
             "beta_m_error": maps.beta_m / true.beta_m - 1,
             "beta_n_error": maps.beta_n / true.beta_n - 1,
             "sigma_a_error": float(np.abs(mean / true_mean - 1).max()),
-            "sigma_a_seen_error": float(np.median(np.abs(seen[both] / true_seen[both] - 1))),
+            "visible_sigma_a_error": float(np.median(np.abs(shown[both] / true_shown[both] - 1))),
         }
 
     def _score(self, variant: str, pictures: Sequence[tuple[Array, Array]]) -> None:
