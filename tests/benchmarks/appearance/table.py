@@ -102,7 +102,7 @@ class Table:
         gain = None
         problem = FitProblem(captured.mapped, self.training, captured.exposure.scale, captured.skin)
         sizes = Sizes([len(o.pixels) for o in self.training], len(self.training[0].lights))
-        lit = self.training[0].single_lights
+        lit, level = self.training[0].single_lights, 1.0
         for variant in variants:
             begun = time.perf_counter()
             self.progress(variant, 0.0)
@@ -120,7 +120,6 @@ class Table:
                 )
             worked = time.process_time() - worked
             maps, gain = found.maps, found.gain
-            level = 1.0
             if found.lobes is not None and np.isfinite(found.lobes[:, 3]).any():
                 lit = tuple(x for x in with_lobes(lit, found.lobes) if isinstance(x, Light))
                 level = mean_level(problem, found.lobes, gain)
@@ -134,7 +133,7 @@ class Table:
             }
         gain = np.ones(len(lit)) if gain is None else gain
         if fields:
-            self._fields(maps, [x.scaled(g) for x, g in zip(lit, gain, strict=True)])
+            self._fields(maps, [x.scaled(g) for x, g in zip(lit, gain, strict=True)], level)
         self.score_maps(TRUTH, captured.truth, captured.true_mapped, 0.0)
         self.found = maps, gain
         return self.variants
@@ -143,8 +142,11 @@ class Table:
         """Numbers of the views and of the held-out lights that are compared."""
         return list(self.captured.judged)
 
-    def _fields(self, maps: HairMaps, lights: Sequence[Light]) -> None:
-        """Score `FIELDS` on top of `maps` under the fitted `lights`, as a user's fit makes them."""
+    def _fields(self, maps: HairMaps, lights: Sequence[Light], level: float) -> None:
+        """Score `FIELDS` on top of `maps` under the fitted `lights`, as a user's fit makes them.
+
+        Held-out lights have `level`.
+        """
         captured, request = self.captured, FieldRequest()
         mapped, rng = captured.mapped, np.random.default_rng(self.seed)
         scene = mapped.with_maps(maps).with_skin(captured.skin)
@@ -167,7 +169,7 @@ class Table:
             found = find_hits(mapped, o.camera, pixels, hits)
             frames = o.radiance[:, few], o.valid[:, few]
             views.append(Pictures(found, tuple(lights), np.stack(halves), *frames))
-        rendered = self._rendered(scene)
+        rendered = self._rendered(scene, level)
         for name, options in FIELDS.items():
             self.progress(name, 0.0)
             worked = time.process_time()
@@ -178,7 +180,7 @@ class Table:
                 o, pair = captured.views[k], rendered[k]
                 if fit.decision.kept or options.kind == "whole":
                     at = fit.field.at(find_hits(mapped, o.camera, o.pixels, HITS))
-                    under = [o.single_lights[i] for i in judged]
+                    under = [o.single_lights[i].scaled(level) for i in judged]
                     pair = at.lit(pair[0], under), at.lit(pair[1], under)
                 lit += list(zip(*pair, strict=True))
             self._score(name, lit)
