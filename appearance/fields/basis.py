@@ -66,33 +66,33 @@ class ViewBasis:
     def at_pixels(self, coefficients: Floats) -> Floats:
         """`coefficients (M, v · n · c)` as harmonics in the world `(P, n, c)`."""
         n = self.harmonics
-        found = self.views @ coefficients.reshape(self.views.shape[1], -1)
+        columns = coefficients.shape[1] // n**2
+        found = self.views @ coefficients.reshape(self.views.shape[1], n * columns)
         if self.turned is not None:
-            found = self.turned @ found.reshape(len(found) * n, -1)
-        return np.asarray(found.reshape(-1, n, coefficients.shape[1] // n**2))
+            found = self.turned @ found.reshape(len(found) * n, columns)
+        return np.asarray(found.reshape(-1, n, columns))
 
     def at_anchors(self, values: Floats) -> Floats:
         """The transpose: `values (P, n, c)` gathered at the anchors `(M, v · n · c)`."""
-        n = self.harmonics
+        n, columns = self.harmonics, values.shape[2]
+        flat = values.reshape(len(values) * n, columns)
         if self.turned is not None:
-            flat = self.turned.T @ values.reshape(len(values) * n, -1)
-        else:
-            flat = values
-        gathered = self.views.T @ flat.reshape(self.views.shape[0], -1)
-        return np.asarray(gathered.reshape(-1, n * n * values.shape[2]))
+            flat = self.turned.T @ flat
+        gathered = self.views.T @ flat.reshape(self.views.shape[0], n * columns)
+        return np.asarray(gathered.reshape(-1, n * n * columns))
 
     def squares(self, values: Floats) -> Floats:
         """Approximate diagonal `(M, v · n · c)` at the anchors of the diagonal `values (P, n, c)`
         at the pixels, which must be equal within each degree."""
         squared = self.views.copy()
         squared.data = squared.data**2
-        flat = values.reshape(len(values), -1)
+        n, columns = self.harmonics, values.shape[2]
+        flat = values.reshape(len(values), n * columns)
         if self.pixel is not None:
             flat = flat[self.pixel]
             # hits of one pixel mostly share an anchor: K of weight 1/K are one of weight 1
             squared.data *= np.float32(len(flat) / max(len(values), 1))
-        n = self.harmonics
-        return np.asarray((squared.T @ flat).reshape(-1, n * n * values.shape[2]))
+        return np.asarray((squared.T @ flat).reshape(-1, n * n * columns))
 
 
 def _turning(blocks: Sequence[Floats], pixel: Ints, pixels: int) -> Any:
@@ -104,8 +104,8 @@ def _turning(blocks: Sequence[Floats], pixel: Ints, pixels: int) -> Any:
         within = np.arange(k * k, (k + 1) ** 2, dtype=np.int32)
         # CSC: a column is a harmonic of a hit's frame, its rows those of the world
         rows = pixel.astype(np.int32)[:, None, None] * n + within
-        index.append(np.broadcast_to(rows, block.shape).reshape(count, -1))
-        values.append(block.reshape(count, -1))
+        index.append(np.broadcast_to(rows, block.shape).reshape(count, within.size**2))
+        values.append(block.reshape(count, within.size**2))
     each = np.repeat([2 * k + 1 for k in range(len(parts))], [2 * k + 1 for k in range(len(parts))])
     bounds = np.concatenate([[0], np.cumsum(np.tile(each, count))])
     flat = np.concatenate(values, axis=1).ravel(), np.concatenate(index, axis=1).ravel(), bounds

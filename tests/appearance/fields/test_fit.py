@@ -12,9 +12,11 @@ from appearance.fields.basis import ViewBasis
 from appearance.fields.fit import Monitor, fit_pictures
 from appearance.fields.form import Form
 from appearance.fields.grams import Gram, Samples
+from appearance.fields.hits import HitOptions, find_hits
 from appearance.fields.options import FieldOptions
 from appearance.fields.solver import LeastSquares, ViewSystem, conjugate_gradients
 from appearance.fields.validation import Folds, _elsewhere
+from appearance.render.coverage import coverage
 from appearance.render.harmonics import harmonics
 from reconstruction import BadOptions, Light, parse_options
 from reconstruction.files import durable
@@ -87,6 +89,16 @@ def test_pixels_and_anchors_are_transposes(planted, strands):
     g = rng.normal(size=(len(view.hits.pixels), 9, 3)).astype(np.float32)
     one, other = (basis.at_pixels(x) * g).sum(), (x * basis.at_anchors(g)).sum()
     assert one == pytest.approx(other, rel=1e-3, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["modulation", "additive"])
+def test_pixels_without_hair_get_no_field(planted, kind):
+    field = planted.truth(kind)
+    camera = planted.views(field, 4)[0].hits.camera
+    bare = np.flatnonzero((coverage(planted.mapped.scene, camera)["hair"] == 0).ravel())[:5]
+    found = field.at(find_hits(planted.mapped, camera, bare, HitOptions(8)))
+    assert found.coefficients.shape == (5, 4, 3)
+    assert not found.coefficients.any()
 
 
 def test_coarse_grids_say_on_the_finest_what_they_say_by_themselves(planted):
