@@ -96,5 +96,5 @@ def test_a_rig_whose_frames_need_more_memory_than_is_free_is_refused(
     words = ["--rig", rig_file, "--state", tmp_path / "state", *small_subject(tmp_path)]
     assert main([str(w) for w in words]) == 2
     error = capsys.readouterr().err
-    assert "of 1 lights take about 0.5 GB of memory in 1 rendering processes, and 0.2 GB" in error
+    assert "of 1 lights take about 0.3 GB of memory in 1 rendering processes, and 0.2 GB" in error
     assert "use fewer --processes" in error
