@@ -20,7 +20,7 @@ from appearance.inverse_rendering import losses
 from appearance.inverse_rendering.batches import Batch
 from appearance.inverse_rendering.options import Effort
 from appearance.inverse_rendering.problem import FitProblem
-from appearance.inverse_rendering.unknowns import Raw, derivatives
+from appearance.inverse_rendering.unknowns import Raw, derivatives, encode_scalar
 from reconstruction import Progress, silent
 from reconstruction.arrays import Array
 
@@ -43,7 +43,8 @@ _BEGINS = (-1.8, 0.4)
 _ALIKE = 3 * 32
 """Successive values with correlated errors."""
 FOUND = {"beta_m": (0.05, 0.8), "beta_n": (0.2, 0.7)}
-"""Roughness recovered from any start in tests; a result outside these ranges is doubtful."""
+"""Limits of roughness: what is recovered from any start in tests. Without them a fit on misplaced
+strands ended at beta_n 0.04, whose glints no frame shows."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def solve_global_parameters(
 
     "sigma_a" shifts all cells' logits of a channel; "gain" is the intensities of the pairs' lights,
     with mean 1. Estimates have priors of the widths in `WIDE`, gains of 3 % about the calibration.
-    Roughness is recovered within `FOUND`; a narrower beta_n results in up to 0.3. Hair that starts
+    Roughness stays within `FOUND`; a narrower beta_n results in up to 0.3. Hair that starts
     too bright in all channels is darkened first, as a wide lobe would explain its image too. Takes
     the time of five to sixteen images of twice `effort.spp` paths a pixel. Returns the input if an
     image is not finite.
@@ -106,6 +107,9 @@ def solve_global_parameters(
             return Solved(*given, system.left_open())
         for number, d in zip(numbers, step * system.wide, strict=True):
             raw, gain = _moved(raw, gain, number, d)
+        for name in FOUND.keys() & set(names):
+            least, most = (encode_scalar(name, x) for x in FOUND[name])
+            raw = raw | {name: np.clip(raw[name], least, most)}
         if "gain" in names:
             gain[lights] /= np.exp(np.log(gain[lights]).mean())
         away += step

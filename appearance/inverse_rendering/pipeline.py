@@ -142,9 +142,11 @@ def _doubts(start: HairMaps, found: HairMaps, measured: bool) -> list[str]:
     `measured`: that of the start was.
     """
     doubts = [
-        f"{name} {value:.2f} lies outside {least} to {most}, the range in which it was recovered"
+        f"{name} {value:.2f} is not inside {least} to {most}, the range in which it is recovered: "
+        "the strands are misplaced, or the fibres' roughness lies beyond it"
         for name, (least, most) in FOUND.items()
-        if not least <= (value := float(getattr(found, name))) <= most
+        if not 1.001 * least < (value := float(getattr(found, name))) < 0.999 * most
+        and value != getattr(start, name)
     ]
     before, after = (float(x.sigma_a.mean()) for x in (start, found))
     if after > max(1.0, BLACKER * before):

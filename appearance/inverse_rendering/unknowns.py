@@ -33,10 +33,7 @@ def encode(maps: HairMaps) -> Raw:
             [MOST_TILT * np.arctanh(np.clip(maps.tilt_deg / MOST_TILT, -0.99, 0.99))]
         ),
     }
-    for name, (low, high) in RANGES.items():
-        share = np.clip((getattr(maps, name) - low) / (high - low), 1e-4, 1 - 1e-4)
-        raw[name] = np.array([np.log(share / (1 - share))])
-    return raw
+    return raw | {name: np.array([encode_scalar(name, getattr(maps, name))]) for name in RANGES}
 
 
 def decode(raw: Raw) -> HairMaps:
@@ -61,6 +58,13 @@ def derivatives(raw: Raw) -> Raw:
         share = expit(raw[name])
         out[name] = (high - low) * share * (1 - share)
     return out
+
+
+def encode_scalar(name: str, value: float) -> float:
+    """The logit of a roughness or index in its range of `RANGES`."""
+    low, high = RANGES[name]
+    share = np.clip((value - low) / (high - low), 1e-4, 1 - 1e-4)
+    return float(np.log(share / (1 - share)))
 
 
 def encode_absorption(sigma_a: Array) -> Array:

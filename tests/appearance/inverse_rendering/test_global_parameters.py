@@ -62,6 +62,18 @@ def test_smooth_and_rough_fibres(tufted, beta_m, beta_n):
     np.testing.assert_allclose(maps.sigma_a[0, 0, 0], truth.sigma_a, rtol=0.15)
 
 
+def test_roughness_of_misplaced_hair_ends_inside_the_range_in_which_it_is_recovered(plain):
+    """Each view's pixels are another's: no roughness renders such frames."""
+    views = [
+        replace(o, radiance=o.radiance[:, np.random.default_rng(0).permutation(len(o.pixels))])
+        for o in plain.views
+    ]
+    problem = FitProblem(plain.mapped, views, plain.scale, plain.skin)
+    _, _, maps, _, _ = solve(problem, HairAppearance((0.2, 0.2, 0.2), 0.3, 0.3))
+    assert 0.05 <= maps.beta_m <= 0.8
+    assert 0.2 <= maps.beta_n <= 0.7
+
+
 @pytest.mark.slow
 def test_white_hair(tufted):
     """What is left of its light after a crossing; the roughness of a lobe that all light makes."""

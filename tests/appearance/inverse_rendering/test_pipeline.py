@@ -152,7 +152,8 @@ def test_where_no_stage_is_kept_suns_fit_is_rendered(made, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("hair", "doubt"),
     [
-        (HairAppearance((0.06, 0.12, 0.3), 0.93, 0.35), "beta_m 0.93 lies outside 0.05 to 0.8"),
+        (HairAppearance((0.06, 0.12, 0.3), 0.93, 0.35), "beta_m 0.93 is not inside 0.05 to 0.8"),
+        (HairAppearance((0.06, 0.12, 0.3), 0.4, 0.7), "beta_n 0.70 is not inside 0.2 to 0.7"),
         (HairAppearance((1.7, 1.7, 1.7), 0.36, 0.3), "beta_m 0.36 may be too rough"),
         (HairAppearance((0.2, 0.2, 0.2), 0.6, 0.3), "beta_m 0.60 differs from 0.40"),
     ],
