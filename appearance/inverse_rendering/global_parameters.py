@@ -43,8 +43,8 @@ _BEGINS = (-1.8, 0.4)
 _ALIKE = 3 * 32
 """Successive values with correlated errors."""
 FOUND = {"beta_m": (0.05, 0.8), "beta_n": (0.2, 0.7)}
-"""Limits of roughness: what is recovered from any start in tests. Without them a fit on misplaced
-strands ended at beta_n 0.04, whose glints no frame shows."""
+"""Limits of roughness: what is recovered from any start in tests. On misplaced strands the error
+falls towards a beta_n below them, whose glints no frame shows."""
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ FLAT = 0.7
 """Standard error over the prior's width above which the response is flat: of its square, half."""
 _SHOWN = 4
 """Hair pixels of an image for each one that is fitted, at least."""
+_AT_LIMIT = 1e-3
+"""Relative distance from a limit of roughness at which it is reached."""
 FROM_SUN = 1.15
 """Ratio to Sun's roughness, or its inverse, above which a fitted roughness is doubtful."""
 BLACKER = 3.0
@@ -141,13 +143,16 @@ def _doubts(start: HairMaps, found: HairMaps, measured: bool) -> list[str]:
 
     `measured`: that of the start was.
     """
-    doubts = [
-        f"{name} {value:.2f} is not inside {least} to {most}, the range in which it is recovered: "
-        "the strands are misplaced, or the fibres' roughness lies beyond it"
-        for name, (least, most) in FOUND.items()
-        if not 1.001 * least < (value := float(getattr(found, name))) < 0.999 * most
-        and value != getattr(start, name)
-    ]
+    doubts = []
+    for name, (least, most) in FOUND.items():
+        value, begun = (float(getattr(x, name)) for x in (found, start))
+        # a start at a limit that no stage moved is none
+        margin = -_AT_LIMIT if np.isclose(value, begun, rtol=_AT_LIMIT) else _AT_LIMIT
+        if not (1 + margin) * least < value < (1 - margin) * most:
+            doubts.append(
+                f"{name} {value:.2f} is not inside {least} to {most}, the range in which it is "
+                "recovered: the strands are misplaced, or the fibres' roughness lies beyond it"
+            )
     before, after = (float(x.sigma_a.mean()) for x in (start, found))
     if after > max(1.0, BLACKER * before):
         doubts.append(

@@ -23,7 +23,7 @@ from appearance import (
 from appearance.bsdf.maps import HairMaps
 from appearance.inverse_rendering import loop, pipeline
 from appearance.inverse_rendering.loop import Outcome
-from appearance.inverse_rendering.unknowns import encode
+from appearance.inverse_rendering.unknowns import decode, encode
 from appearance.metrics.decision import Decision
 from appearance.sun_fit.fitted_appearance import FittedAppearance
 from reconstruction import (
@@ -147,6 +147,19 @@ def test_where_no_stage_is_kept_suns_fit_is_rendered(made, tmp_path, monkeypatch
     assert FittedModel.load(other, capture).maps.sigma_a.max() == pytest.approx(0.2)
     assert not other.has("hair_maps.npz")
     assert not other.report()["inverse_rendering"].warnings
+
+
+@pytest.mark.parametrize(
+    ("beta_n", "doubtful"), [(0.2, False), (0.7, False), (0.15, True), (0.1999, False)]
+)
+def test_a_start_at_a_limit_of_roughness_is_no_doubt_where_no_stage_moved_it(beta_n, doubtful):
+    """Sun's fit holds beta_n at 0.2, a limit; encoding changes its last digits."""
+    start = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, beta_n))
+    found = pipeline._doubts(start, decode(encode(start)), measured=True)
+    assert ["beta_n" in x for x in found] == [True] * doubtful
+    moved = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.2))
+    begun = HairMaps.of(HairAppearance((0.2, 0.2, 0.2), 0.4, 0.3))
+    assert pipeline._doubts(begun, moved, measured=True)[0].startswith("beta_n 0.20 is not inside")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -75,7 +74,7 @@ class Table:
     def run(
         self, variants: Sequence[Material] = MATERIAL, fields: bool = False
     ) -> dict[str, dict[str, Any]]:
-        """Baselines, `variants`, the `FIELDS` if asked for, then the truth itself."""
+        """Baselines, `variants`, with `fields` the `FIELDS`, then the truth itself."""
         captured = self.captured
         colour = np.mean([o.radiance.mean((0, 1)) for o in self.training], axis=0)
         views, pairs = captured.views, self._truth()
@@ -155,17 +154,10 @@ class Table:
         for o in self.training:
             few = np.sort(rng.permutation(len(o.pixels))[:most])
             pixels, hits = o.pixels[few], HitOptions(request.hits, self.seed)
-            sampling = Sampling(request.spp // 2, captured.rig.max_depth)
-            halves = [
-                olat_smoothed(
-                    scene,
-                    o.camera,
-                    lights,
-                    replace(sampling, seed=2 * self.seed + k),
-                    pixels=pixels,
-                )
-                for k in (0, 1)
-            ]
+            halves = []
+            for seed in (2 * self.seed, 2 * self.seed + 1):
+                half = Sampling(request.spp // 2, captured.rig.max_depth, seed)
+                halves.append(olat_smoothed(scene, o.camera, lights, half, pixels=pixels))
             found = find_hits(mapped, o.camera, pixels, hits)
             frames = o.radiance[:, few], o.valid[:, few]
             views.append(Pictures(found, tuple(lights), np.stack(halves), *frames))
@@ -175,15 +167,15 @@ class Table:
             worked = time.process_time()
             fit = fit_pictures(views, Places.of(mapped.root_uv), captured.exposure.scale, options)
             worked = time.process_time() - worked
-            lit = []
+            images = []
             for k, judged in self._judged().items():
                 o, pair = captured.views[k], rendered[k]
                 if fit.decision.kept or options.kind == "whole":
                     at = fit.field.at(find_hits(mapped, o.camera, o.pixels, HITS))
                     under = [o.single_lights[i].scaled(level) for i in judged]
                     pair = at.lit(pair[0], under), at.lit(pair[1], under)
-                lit += list(zip(*pair, strict=True))
-            self._score(name, lit)
+                images += list(zip(*pair, strict=True))
+            self._score(name, images)
             self.variants[name] |= {
                 "cpu_seconds": worked,
                 "decision": fit.decision.to_dict(),
