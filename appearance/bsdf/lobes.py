@@ -26,6 +26,8 @@ from appearance.bsdf.bessel import scaled_i0
 LOBES = 4
 LEAST_CHOICE = 1e-9
 """Lobes whose probability is together below this are never sampled: no density underflows."""
+PARTS, OFFSETS = 4, 4
+"""Parts of a fibre's width that `mean_over_width` averages over, and points of each."""
 _TINY = 1e-18
 """Its square is a normal float32."""
 _LEAST_UNIFORM = 2.0**-25
@@ -224,6 +226,43 @@ def value_known(k: Known, wo: Any) -> Any:
     value: Any = 0.0
     for p in range(LOBES):
         value = value + k.attenuation[p] * _lobe(k, p, wo.y, cosine, gamma)
+    return value
+
+
+def mean_over_width(fibre: Fibre, wi: Any) -> Callable[[Any], Any]:
+    """`evaluate`'s value, averaged over the part of the width where `wi` leaves, for any `wo`.
+
+    For fibres thinner than a pixel, with less noise than a value at one offset h: the mean of
+    `OFFSETS` values at equal distances in one of `PARTS` equal parts, that of `wi` among them. The
+    visible and the lit part of a fibre are not independent: direct light on the demo's hair is 0.3
+    to 0.6 % too bright (halves: 1.8 %, eighths: 0.1 %), and up to 1.8 % from the side.
+    """
+    k = known(fibre, wi)
+    cosine, x, _ = across(wi)
+    place = dr.clip(0.5 * PARTS * (1 - x), 0, PARTS * (1 - 1e-6))
+    part = dr.floor(place)
+    attenuation, turns = [], []
+    for j in range(OFFSETS):
+        within = place - part + j / OFFSETS
+        h = 2 / PARTS * (part + within - dr.floor(within)) - 1
+        cos_gamma, gamma = dr.sqrt((1 - h) * (1 + h)), dr.asin(h)
+        gamma_t, length = refraction(cosine, h, cos_gamma, fibre.eta)
+        f, through = fresnel(cosine * cos_gamma, fibre.eta)
+        attenuation.append(attenuations(f, through, fibre.sigma_a * length))
+        middle = k.gamma - 2 * gamma
+        turns.append((middle, middle + 2 * gamma_t + pi, middle + 4 * gamma_t))
+
+    def value(wo: Any) -> Any:
+        cosine, _, _ = across(wo)
+        gamma = azimuth(wo)
+        total: Any = 0.0
+        for p in range(LOBES):
+            around: Any = 0.0
+            for a, turn in zip(attenuation, turns, strict=True):
+                around += a[p] * (k.n.at(gamma - turn[p]) if p < LOBES - 1 else 0.5 / pi)
+            total += around * k.m[p].at(k.sine[p], k.cosine[p], wo.y, cosine)
+        return total / OFFSETS
+
     return value
 
 

@@ -11,11 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from appearance.bsdf.absorption import of_melanin
-from appearance.bsdf.far_field import LEAST_BETA_M, LEAST_BETA_N, FarField
 from appearance.bsdf.lobes import Fibre
 from appearance.bsdf.shading_frame import ShadingFrame, axis_in_frame
 from appearance.bsdf.strand_coordinates import NAMES, place_in_segment
-from appearance.scene.hair_appearance import HairAppearance
 from reconstruction.array_backend import for_kernels
 
 INFINITE = float("inf")
@@ -67,23 +65,6 @@ class HairParameters:
         self._constant = {name: _constant(self.values[name]) for name in tables}
         turn = self._constant.get("rotation", [])
         self._turns = turn is None or any(x[0] != 0 for x in turn)
-        self.__dict__.pop("far_field", None)
-
-    @cached_property
-    def far_field(self) -> FarField | None:
-        """The mean over the width; None where hair varies or lobes are narrower than a node."""
-        varies = [
-            self._constant[name] is None if dr.is_tensor_v(value) else dr.width(value) > 1
-            for name, value in self.values.items()
-        ]
-        if self._turns or any(varies):
-            return None
-        fibre = self.fibre(StrandHit({}, None, None))
-        one = (fibre.beta_m, fibre.beta_n, fibre.eta, dr.rad2deg(fibre.tilt))
-        r, g, b, *rest = (float(x[0]) for x in (*fibre.sigma_a, *one))
-        hair = HairAppearance((r, g, b), *rest)
-        smooth = hair.beta_m >= LEAST_BETA_M and hair.beta_n >= LEAST_BETA_N
-        return FarField(hair) if smooth else None
 
     def fibre(self, place: StrandHit) -> Fibre:
         """The fibre at a hit."""

@@ -25,7 +25,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from appearance.bsdf.lobes import evaluate, known, sample, value_known
+from appearance.bsdf.lobes import evaluate, known, mean_over_width, sample, value_known
 from appearance.bsdf.parameters import HairParameters, StrandHit
 
 
@@ -76,14 +76,13 @@ def plugin() -> Any:
         def towards(self, si: Any, active: Any, mean_width: bool) -> Callable[[Any, Any], Any]:
             """`eval` of `si` towards `(wo, active)`; what does not depend on `wo` is computed once.
 
-            With `mean_width` averaged over parts of the width (`FarField`), where the hair is
-            uniform.
+            With `mean_width` averaged over parts of the width (`mean_over_width`).
             """
             fibre, frame = self._at(si, active)
             wi = frame.enter(si.wi)
-            if mean_width and self.parameters.far_field is not None:
-                mean = self.parameters.far_field.towards(wi)
-                return lambda wo, active: mean(frame.enter(wo), active)
+            if mean_width:
+                mean = mean_over_width(fibre, wi)
+                return lambda wo, active: mi.Color3f(mean(frame.enter(wo)))
             k = known(fibre, wi)
             return lambda wo, active: mi.Color3f(value_known(k, frame.enter(wo)))
 

@@ -16,7 +16,6 @@ from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.mixed import Environment
 from appearance.render.olat import render_indirect, render_olat, spread_out
 from appearance.render.smoothed import (
-    DIRECT,
     environment_smoothed,
     mean_factor,
     olat_smoothed,
@@ -34,6 +33,8 @@ CELLS = 10, 24
 """Rows and columns of a turning map's panels."""
 _FAR = 100.0
 """Metres to these panels."""
+_DIRECT = 64
+"""Least number of paths a pixel of light at the first hit."""
 _SAMPLED = {"first_lights": 24, "deep_lights": 16}
 """Panels sampled at a path's first and later vertices."""
 _PIXELS = 10_000
@@ -99,7 +100,7 @@ def turning_light(
 
     Counter-clockwise from above. The model is rendered once under each of `CELLS` panels that tile
     the sphere; a frame is the sum of these images weighted by the turned map's mean over each
-    panel. First-hit light has at least `DIRECT` paths a pixel, indirect light is smoothed. Raises
+    panel. First-hit light has at least `_DIRECT` paths a pixel, indirect light is smoothed. Raises
     `ValueError` without a frame.
     """
     if frames < 1:
@@ -108,7 +109,7 @@ def turning_light(
     weights = np.stack([cell_means(envmap, k / frames) for k in range(frames)]).astype(np.float32)
     scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
     index, panels = covered_pixels(scene, camera), _panels()
-    spp, seed, more = sampling.spp, sampling.seed, max(sampling.spp, DIRECT) // 2
+    spp, seed, more = sampling.spp, sampling.seed, max(sampling.spp, _DIRECT) // 2
     parts = np.zeros((3, frames, len(index), 3), np.float32)
     tiles = -(-len(index) // _PIXELS)
     for k in range(tiles):

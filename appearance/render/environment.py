@@ -101,8 +101,8 @@ def direct_environment(
 
     Of flat `pixels (P,)`, or of all that see the subject, with `PER_HIT` directions a hit. A
     pixel's directions are a golden-ratio sequence on a curve through the map (`_along_curve`):
-    under half the noise of independent ones on smooth surfaces. Uniform fibres scatter the mean
-    over parts of their width.
+    under half the noise of independent ones on smooth surfaces. Fibres scatter the mean over parts
+    of their width.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
     image = np.zeros((camera.height * camera.width, 3), np.float32)
@@ -130,8 +130,7 @@ def indirect_environment(
 ) -> Floats:
     """`render_environment` from the second hit on, of flat `pixels (P,)`: `(H, W, 3)`.
 
-    Uniform fibres scatter the mean over parts of their width. A field that is all of the light has
-    none.
+    Fibres scatter the mean over parts of their width. A field that is all of the light has none.
     """
     sky = Sky.of(check_environment(envmap, "envmap"), 0.0)
     image = np.zeros((camera.height * camera.width, 3), np.float32)

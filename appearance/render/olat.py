@@ -110,8 +110,7 @@ def render_indirect(
 ) -> Floats:
     """Indirect light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    Uniform fibres have the BSDF's mean over parts of their width (`FarField`), with less noise.
-    Other hair has the BSDF of `render_olat`.
+    Fibres scatter the mean of the BSDF over parts of their width (`mean_over_width`).
     """
     single, mix = components(lights)
     view = _View(scene, camera, single, pixel_indices(camera, pixels))
@@ -130,8 +129,8 @@ def render_direct(
 ) -> Floats:
     """Direct light of `render_olat`, `(L, P, 3)`, without the scene's field.
 
-    With the mean BSDF of `render_indirect`: half of the paths or fewer for the same noise, and
-    1 % too bright on the demo's hair (see `FarField`).
+    With the mean BSDF of `render_indirect`: half of the paths for the same noise, and 0.6 % too
+    bright on the demo's hair (see `mean_over_width`).
     """
     single, mix = components(lights)
     view = _View(scene, camera, single, pixel_indices(camera, pixels))

@@ -41,17 +41,11 @@ def camera_rays(camera: Camera, u: Any, v: Any) -> Any:
 class Surface:
     """The surfaces of `scene` and their BSDF; made once a kernel.
 
-    With `mean_width` a fibre scatters the mean over parts of its width, if `has_mean_width`.
+    With `mean_width` a fibre scatters the mean over parts of its width (`mean_over_width`).
     """
 
     scene: HairScene
     mean_width: bool = field(default=False, kw_only=True)
-
-    @property
-    def has_mean_width(self) -> bool:
-        """Whether the hair is uniform, with lobes wide enough for a `FarField`."""
-        parameters = getattr(self.scene.hair_bsdf, "parameters", None)
-        return getattr(parameters, "far_field", None) is not None
 
     def interact(self, ray: Any, active: Any) -> Any:
         """The first `SurfaceInteraction3f` along `ray`.

@@ -24,7 +24,7 @@ from appearance.render.olat import (
     render_indirect,
     spread_out,
 )
-from appearance.render.paths import Surface, pixel_indices
+from appearance.render.paths import pixel_indices
 from appearance.render.pixel_field import field_of
 from appearance.render.tracing import LANE_BYTES, Sampling
 from appearance.scene.hair_scene import HairScene
@@ -40,9 +40,8 @@ _RARE = 2.0
 """Multiple of the mean over the wide window above which light is that of a rare path."""
 _AT_A_TIME = 16
 """Lights whose full images are in memory at once."""
-DIRECT, DIRECT_OF_MEANS = 64, 36
-"""Least number of paths a pixel of direct light, each a quarter of the cost of a full path; and
-where fibres scatter the mean over parts of their width."""
+DIRECT = 36
+"""Least number of paths a pixel of direct light, each a quarter of the cost of a full path."""
 THRIFT = 6.0
 """`OlatOptions.thrift` of indirect light: 0.1 dB less than at 3, for a fifth less time."""
 _DIRECT_OF_MAPS = 6
@@ -60,8 +59,8 @@ def olat_smoothed(
     """`render_olat` with its indirect light smoothed over `SIGMA` pixels.
 
     Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`, which saves memory, not time.
-    `sampling.spp` paths a pixel are of indirect light, and twice as many, at least `DIRECT` or
-    `DIRECT_OF_MEANS`, of direct light (`render_direct`).
+    `sampling.spp` paths a pixel are of indirect light, and twice as many, at least `DIRECT`, of
+    direct light (`render_direct`).
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     lights, mix = components(lights)
@@ -74,9 +73,8 @@ def olat_smoothed(
     rest = render_indirect(
         scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed, thrift=THRIFT
     )
-    least = DIRECT_OF_MEANS if Surface(scene).has_mean_width else DIRECT
     out = render_direct(
-        scene, camera, lights, index, spp=max(2 * spp, least), seed=seed + (1 << 31), thrift=1.0
+        scene, camera, lights, index, spp=max(2 * spp, DIRECT), seed=seed + (1 << 31), thrift=1.0
     )
     for k in range(0, len(lights), _AT_A_TIME):
         part = slice(k, k + _AT_A_TIME)

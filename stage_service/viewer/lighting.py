@@ -116,7 +116,7 @@ class Lighting:
         0."""
         cosines = (np.arange(COSINES) + 0.5) / COSINES
         turns = np.pi * (np.arange(TURNS) + 0.5) / TURNS
-        (values,) = azimuthal_table(self.fitted.maps.mean(), cosines, turns)
+        values = azimuthal_table(self.fitted.maps.mean(), cosines, turns)
         return np.pad(values, ((0, 0),) * 3 + ((0, 1),)).astype("<f4").tobytes()
 
     def few(self, weights: dict[int, list[float]]) -> list[dict[str, Any]]:

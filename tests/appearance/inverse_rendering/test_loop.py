@@ -33,7 +33,7 @@ def test_one_colour_and_roughness_are_found_from_pictures(plain, tufted, options
     found = run(plain, START, stages=("shared",), options=options, monitor=monitor)
     (decision,) = found.decisions
     assert decision.kept
-    assert decision.after < 0.7 * decision.before
+    assert decision.after < 0.75 * decision.before
     assert far(found.maps, tufted.truth) < 0.4 < far(START, tufted.truth)
     assert reported[-1][0].startswith("shared: error on held-out frames 0.")
     assert [share for _, share in reported] == sorted(share for _, share in reported)

@@ -73,7 +73,7 @@ def test_a_white_sky_is_reflected_in_full_by_clear_hair_in_smoothed_pictures(sma
     """White furnace: direct and indirect light add up to the share of a pixel that hair covers."""
     clear = HairAppearance((0.0, 0.0, 0.0), 0.3, 0.3)
     scene, camera = build_scene(small.tuft(60), None, hair=clear), small.camera(size=32)
-    image = environment_smoothed(scene, camera, np.ones((8, 16, 3)), Sampling(32, 60))
+    image = environment_smoothed(scene, camera, np.ones((8, 16, 3)), Sampling(128, 60))
     covered = coverage(scene, camera, 1024)["hair"]
     assert image.sum((0, 1)) == pytest.approx(np.full(3, covered.sum()), rel=0.03)
 
