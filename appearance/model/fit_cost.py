@@ -100,13 +100,13 @@ def estimate_fit(
         "spatial": of_cells + judged,
         "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
         "lights": shared + (_LOBE_PATH * lobes if turned else of_cells * ("spatial" in stages)),
-        # every pixel of the subject is rendered, for what is smooth
+        # indirect light is rendered in every pixel of the subject, since it is smoothed
         "field": _PATHS["field"]
-        + _FIELD_PIXEL * sum(of_field)
-        + sum(shown) * many * (_DIRECT + _INDIRECT * field.spp),
+        + (_FIELD_PIXEL + _DIRECT * many) * sum(of_field)
+        + _INDIRECT * field.spp * many * sum(shown),
     }
     points = len(strands.points)
-    frames = max(map(frames_memory, training.rig.cameras, shown, [many] * len(shown)))
+    frames = max(map(frames_memory, training.rig.cameras, shown, [many] * len(shown), of_field))
     memory = {
         "sun": scene_memory(points, 1e-9 * _SUN_BYTES * lights * sum(observed), mapped=False),
         "field": scene_memory(

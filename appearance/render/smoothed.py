@@ -58,9 +58,9 @@ def olat_smoothed(
 ) -> Floats:
     """`render_olat` with its indirect light smoothed over `SIGMA` pixels.
 
-    Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`, which saves memory, not time.
-    `sampling.spp` paths a pixel are of indirect light, and twice as many, at least `DIRECT`, of
-    direct light (`render_direct`).
+    Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`. Indirect light, of
+    `sampling.spp` paths a pixel, is rendered wherever the subject is; direct light
+    (`render_direct`) in these pixels only, by twice as many paths, at least `DIRECT`.
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     lights, mix = components(lights)
@@ -74,13 +74,12 @@ def olat_smoothed(
         scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed, thrift=THRIFT
     )
     out = render_direct(
-        scene, camera, lights, index, spp=max(2 * spp, DIRECT), seed=seed + (1 << 31), thrift=1.0
+        scene, camera, lights, wanted, spp=max(2 * spp, DIRECT), seed=seed + (1 << 31), thrift=1.0
     )
     for k in range(0, len(lights), _AT_A_TIME):
         part = slice(k, k + _AT_A_TIME)
         smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
-        out[part] += smooth.reshape(len(smooth), -1, 3)[:, index]
-    out = out[:, np.searchsorted(index, wanted)]
+        out[part] += smooth.reshape(len(smooth), -1, 3)[:, wanted]
     field = field_of(field_on, camera, wanted)
     if field is not None:
         out = field.lit(out, lights)
@@ -88,15 +87,17 @@ def olat_smoothed(
     return out if pixels is not None else spread_out(out, wanted, camera)
 
 
-def memory_needed(camera: Camera, pixels: int, lights: int) -> float:
+def memory_needed(camera: Camera, pixels: int, lights: int, wanted: int | None = None) -> float:
     """Approximate GB that `olat_smoothed` takes where `pixels` show the subject, beside the scene.
 
-    Three arrays of radiance, and the larger of a tile of paths and of the blurred full images.
+    Two arrays of radiance, that of the `wanted` pixels (default: all) and that of indirect light,
+    and the largest of a copy, a tile of paths, and the blurred full images.
     """
     radiance = 12 * lights * pixels
+    share = 1.0 if wanted is None else wanted / max(pixels, 1)
     tile = min(pixels * (FILM_BYTES * lights + LANE_BYTES), OlatOptions().memory)
     blurred = 12 * min(lights, _AT_A_TIME) * (2 * camera.width * camera.height + 7 * pixels)
-    return (2 * radiance + max(tile, blurred, radiance)) / 1e9
+    return ((1 + share) * radiance + max(tile, blurred, radiance)) / 1e9
 
 
 def environment_smoothed(
