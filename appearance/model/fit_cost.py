@@ -21,6 +21,7 @@ from appearance.model.fitted_model import FittedModel
 from appearance.observations import HeldOut
 from appearance.render.coverage import pixel_coverage
 from appearance.render.olat import render_olat
+from appearance.render.smoothed import AREA
 from appearance.render.smoothed import memory_needed as frames_memory
 from appearance.sun_fit.options import FitOptions
 from reconstruction import Capture, Model
@@ -100,10 +101,10 @@ def estimate_fit(
         "spatial": of_cells + judged,
         "correctives": _PATHS["correctives"] + _TURN_PATH * cached + judged,
         "lights": shared + (_LOBE_PATH * lobes if turned else of_cells * ("spatial" in stages)),
-        # indirect light is rendered in every pixel of the subject, since it is smoothed
+        # indirect light of all of the subject's pixels is smoothed, that of few has more paths
         "field": _PATHS["field"]
         + (_FIELD_PIXEL + _DIRECT * many) * sum(of_field)
-        + _INDIRECT * field.spp * many * sum(shown),
+        + _INDIRECT * field.spp * many * sum(map(min, shown, [AREA * x for x in of_field])),
     }
     points = len(strands.points)
     frames = max(map(frames_memory, training.rig.cameras, shown, [many] * len(shown), of_field))

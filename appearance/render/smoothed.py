@@ -34,6 +34,8 @@ from reconstruction.geometry.lights import Lighting, components, mixed
 
 SIGMA = 1.25
 """Standard deviation, pixels, of the filter of indirect light."""
+AREA = 20
+"""Pixels that this filter averages over: 4 pi `SIGMA`²."""
 _WIDE = 4.0
 """Factor on it for the light of rare bright paths."""
 _RARE = 2.0
@@ -60,7 +62,8 @@ def olat_smoothed(
 
     Returns `(L, H, W, 3)`, or `(L, P, 3)` for the flat `pixels (P,)`. Indirect light, of
     `sampling.spp` paths a pixel, is rendered wherever the subject is; direct light
-    (`render_direct`) in these pixels only, by twice as many paths, at least `DIRECT`.
+    (`render_direct`) in these pixels only, by twice as many paths, at least `DIRECT`. Where it
+    takes fewer paths, indirect light is not smoothed: few pixels have more paths for its noise.
     """
     spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     lights, mix = components(lights)
@@ -70,16 +73,21 @@ def olat_smoothed(
     wanted = np.flatnonzero(sees) if pixels is None else pixel_indices(camera, pixels)
     sees[wanted] = True
     index = np.flatnonzero(sees)
+    few = AREA * len(wanted) < len(index)
+    traced, paths = (wanted, AREA * spp) if few else (index, spp)
     rest = render_indirect(
-        scene, camera, lights, index, spp=spp, max_depth=depth, seed=seed, thrift=THRIFT
+        scene, camera, lights, traced, spp=paths, max_depth=depth, seed=seed, thrift=THRIFT
     )
     out = render_direct(
         scene, camera, lights, wanted, spp=max(2 * spp, DIRECT), seed=seed + (1 << 31), thrift=1.0
     )
-    for k in range(0, len(lights), _AT_A_TIME):
-        part = slice(k, k + _AT_A_TIME)
-        smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
-        out[part] += smooth.reshape(len(smooth), -1, 3)[:, wanted]
+    if few:
+        out += rest
+    else:
+        for k in range(0, len(lights), _AT_A_TIME):
+            part = slice(k, k + _AT_A_TIME)
+            smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
+            out[part] += smooth.reshape(len(smooth), -1, 3)[:, wanted]
     field = field_of(field_on, camera, wanted)
     if field is not None:
         out = field.lit(out, lights)

@@ -448,6 +448,20 @@ def test_smoothing_keeps_the_mean_and_takes_the_noise(made):
     assert error[1] < 0.6 * error[0]
 
 
+def test_few_pixels_have_the_light_that_many_paths_find_with_less_noise(made):
+    """Among few pixels there is nothing to smooth: they get more paths."""
+    capture, _, scene = made
+    camera, lights = capture.rig.cameras[0], capture.rig.lights
+    hair = np.flatnonzero(coverage(scene, camera)["hair"] > 0.5)
+    few = hair[:: -(-len(hair) // 6)]
+    reference, plain = (
+        render_olat(scene, camera, lights, spp=spp, seed=spp, pixels=few) for spp in (2048, 9)
+    )
+    found = olat_smoothed(scene, camera, lights, Sampling(9, 16, 3), pixels=few)
+    error = [np.sqrt(np.mean((x - reference) ** 2)) for x in (plain, found)]
+    assert error[1] < 0.5 * error[0]
+
+
 def test_few_paths_bring_direct_light_as_many_do(made):
     capture, _, scene = made
     camera, lights = capture.rig.cameras[0], [capture.rig.light("l4")]
