@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from appearance.render.coverage import coverage
+from appearance.render.coverage import coverage, covered_pixels
 from appearance.render.environment import direct_environment, indirect_environment
 from appearance.render.harmonics import projected
 from appearance.render.olat import (
@@ -28,7 +29,7 @@ from appearance.render.paths import pixel_indices
 from appearance.render.pixel_field import field_of
 from appearance.render.tracing import LANE_BYTES, Sampling
 from appearance.scene.hair_scene import HairScene
-from reconstruction import Camera
+from reconstruction import Camera, Light
 from reconstruction.arrays import AnyFloats, Floats, Ints
 from reconstruction.geometry.lights import Lighting, components, mixed
 
@@ -65,34 +66,52 @@ def olat_smoothed(
     (`render_direct`) in these pixels only, by twice as many paths, at least `DIRECT`. Where it
     takes fewer paths, indirect light is not smoothed: few pixels have more paths for its noise.
     """
-    spp, seed, depth = sampling.spp, sampling.seed, sampling.max_depth
     lights, mix = components(lights)
-    share = coverage(scene, camera, max(spp, 16), seed)
     field_on, scene = scene, replace(scene, field=None)  # what is smooth is the material's
-    sees = (share["hair"] + share["head"]).ravel() > 0
-    wanted = np.flatnonzero(sees) if pixels is None else pixel_indices(camera, pixels)
-    sees[wanted] = True
-    index = np.flatnonzero(sees)
-    few = AREA * len(wanted) < len(index)
-    traced, paths = (wanted, AREA * spp) if few else (index, spp)
-    rest = render_indirect(
-        scene, camera, lights, traced, spp=paths, max_depth=depth, seed=seed, thrift=THRIFT
-    )
-    out = render_direct(
-        scene, camera, lights, wanted, spp=max(2 * spp, DIRECT), seed=seed + (1 << 31), thrift=1.0
-    )
-    if few:
-        out += rest
+    wanted = None if pixels is None else pixel_indices(camera, pixels)
+    if wanted is not None and AREA * len(wanted) < len(covered_pixels(scene, camera, 1)):
+        out = render_indirect(scene, camera, lights, wanted, **_of_indirect(sampling, AREA))
     else:
-        for k in range(0, len(lights), _AT_A_TIME):
-            part = slice(k, k + _AT_A_TIME)
-            smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
-            out[part] += smooth.reshape(len(smooth), -1, 3)[:, wanted]
+        wanted, out = _smoothed_indirect(scene, camera, lights, wanted, sampling)
+    direct = max(2 * sampling.spp, DIRECT)
+    seed = sampling.seed + (1 << 31)
+    out += render_direct(scene, camera, lights, wanted, spp=direct, seed=seed, thrift=1.0)
     field = field_of(field_on, camera, wanted)
     if field is not None:
         out = field.lit(out, lights)
     out = mixed(mix, out)
     return out if pixels is not None else spread_out(out, wanted, camera)
+
+
+def _smoothed_indirect(
+    scene: HairScene,
+    camera: Camera,
+    lights: Sequence[Light],
+    wanted: Ints | None,
+    sampling: Sampling,
+) -> tuple[Ints, Floats]:
+    """Smoothed indirect light `(L, P, 3)` of the flat pixels `wanted (P,)`, and these pixels.
+
+    None: all that see the subject.
+    """
+    share = coverage(scene, camera, max(sampling.spp, 16), sampling.seed)
+    sees = (share["hair"] + share["head"]).ravel() > 0
+    wanted = np.flatnonzero(sees) if wanted is None else wanted
+    sees[wanted] = True
+    index = np.flatnonzero(sees)
+    rest = render_indirect(scene, camera, lights, index, **_of_indirect(sampling))
+    out = np.empty((len(lights), len(wanted), 3), np.float32)
+    for k in range(0, len(lights), _AT_A_TIME):
+        part = slice(k, k + _AT_A_TIME)
+        smooth = smoothed(spread_out(rest[part], index, camera), share, SIGMA)
+        out[part] = smooth.reshape(len(smooth), -1, 3)[:, wanted]
+    return wanted, out
+
+
+def _of_indirect(sampling: Sampling, times: int = 1) -> dict[str, Any]:
+    """Options of `render_indirect` with so many `times` the paths."""
+    spp, depth, seed = times * sampling.spp, sampling.max_depth, sampling.seed
+    return {"spp": spp, "max_depth": depth, "seed": seed, "thrift": THRIFT}
 
 
 def memory_needed(camera: Camera, pixels: int, lights: int, wanted: int | None = None) -> float:
