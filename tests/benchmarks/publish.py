@@ -47,6 +47,11 @@ def check_tree(quick: bool) -> str:
         raise NotPublished("--quick gives no figures: publish without it")
     if changed := _git("status", "--porcelain", "--untracked-files=no"):
         raise NotPublished(f"commit these changes first, so that the page names them:\n{changed}")
+    return commit_of_tree()
+
+
+def commit_of_tree() -> str:
+    """The commit of this checkout. Raises `NotPublished` outside of one."""
     return _git("rev-parse", "--short=12", "HEAD")
 
 

@@ -30,12 +30,15 @@ from benchmarks.appearance.known_subjects import (
     known_subject,
     on_reconstructed,
 )
+from benchmarks.appearance.merged import figures_of, merged
 from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
+from benchmarks.publish import commit_of_tree
 from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
 from reconstruction import Progress, read_strands, silent
 from reconstruction.arrays import Array
+from reconstruction.reading import parse_json
 
 OPTIONS = InverseRenderingOptions(
     free_index=True,
@@ -71,9 +74,11 @@ class Ladders:
     """Which tables are made at size: of `subjects`, for `seeds` seeds of the fit.
 
     (r) needs the `strands` that a reconstruction of the subject made, "cycles" its `capture`.
+    `name` is that of the subject whose hair is dyed.
     """
 
     subjects: Sequence[str] = ("b", "c")
+    name: str = "wavy"
     seeds: int = 1
     strands: Path | None = None
     capture: Path | None = None
@@ -126,6 +131,7 @@ def run_at_size(
     """The table of each of `runs.subjects` at `size` of `AT_SIZE`; `appearance_SIZE.json`."""
     rig, options = AT_SIZE[size], AT_SIZE_OPTIONS
     result: dict[str, Any] = {"options": asdict(options), "rig": asdict(rig), "subjects": {}}
+    result |= {"subject": runs.name, "commit": commit_of_tree()}
     begun = time.process_time()
     frames: Captured | None = None
     for name in runs.subjects:
@@ -326,9 +332,15 @@ SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    if args.results:
+        results = [parse_json(path.read_bytes()) for path in args.results]
+        (args.out / "appearance.md").write_text(merged(results))
+        return {"seeds": args.seeds, "runs": [figures_of(r) for r in results]}
     subject = simulated(args.rig, args.subject, args.head, args.seed)
     if args.size in AT_SIZE and not args.quick:
-        runs = Ladders(args.ladders.split(","), args.seeds, args.strands, args.capture)
+        runs = Ladders(
+            args.ladders.split(","), args.subject, args.seeds, args.strands, args.capture
+        )
         known = (*SUBJECTS, RECONSTRUCTED, "cycles")
         if unknown := [name for name in runs.subjects if name not in known]:
             raise ValueError(f"--ladders: no {', '.join(unknown)}; name some of {', '.join(known)}")
@@ -366,5 +378,6 @@ BENCHMARK = Benchmark(
         option("--seeds", "of the spread, on (b); at size on all", type=int, default=3),
         option("--ladders", "at size: which of b, c, r and cycles", default="b,c"),
         option("--strands", "at size: those of a reconstruction, for r", type=Path),
+        option("--results", "only the tables of these appearance_SIZE.json", type=Path, nargs="+"),
     ),
 )

@@ -19,10 +19,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appearance import HairScene
 from appearance.render.coverage import coverage
-from benchmarks.command import Benchmark
+from benchmarks.command import Benchmark, option
 from benchmarks.results import markdown, save
 from benchmarks.subjects import Subject
 from reconstruction import Camera, CaptureWriter, Light, Model, Progress, Rig, Step, Strands
@@ -93,13 +94,19 @@ SPP = 4
 
 @dataclass(frozen=True)
 class Size:
-    """Cameras of `side`² pixels, lights, strands, and most vertices of a path."""
+    """Cameras of `side`² pixels, lights, strands, and most vertices of a path.
+
+    `block`² pixels of the frames that a fit reads are one rendered pixel, repeated. `points` of a
+    strand, on average; 0: the groom's.
+    """
 
     side: int = 192
     lights: int = 24
     strands: int = 10_000
     bounces: int = 16
     cameras: int = 1
+    block: int = 1
+    points: int = 0
 
     def rig(self) -> Rig:
         """Cameras in an arc around the head's back and sides, and a dome of lights."""
@@ -121,7 +128,11 @@ class Size:
 
     def subject(self, seed: int) -> Simulated:
         """The groom "wavy" at the same coverage."""
-        return make_subject("wavy", seed, self.strands)
+        subject = make_subject("wavy", seed, self.strands)
+        if not self.points:
+            return subject
+        step = float(subject.strands.lengths().mean()) / (self.points - 1)
+        return replace(subject, strands=subject.strands.resampled(step))
 
 
 BASE = Size()
@@ -131,11 +142,14 @@ AXES: dict[str, tuple[int, ...]] = {
     "strands": (50_000, 150_000),
     "bounces": (1, 4),
 }
+ALL = "sun,shared,spatial,correctives,lights,field"
 FITS = {
-    Size(96, 16, 5_000, cameras=4): "sun,shared,spatial,correctives,lights,field",
+    Size(96, 16, 5_000, cameras=4): ALL,
     Size(128, 24, 20_000, cameras=8): "sun,field",
 }
 """Stages of fits: those of the second take longer with each camera."""
+FULL = Size(512, 160, 50_000, cameras=48, block=4, points=100)
+"""A capture and strands of GroomLight's size."""
 QUICK = Size(64, 24, 1_000, 4, cameras=2)
 _LITTLE = {"fit": {"hair_pixels": 800, "iterations": 1, "error_paths": 1, "roughness_spp": 2}}
 
@@ -145,7 +159,9 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     base, axes, fits, options = BASE, AXES, FITS, {}
     if args.quick:
         base, axes, fits, options = QUICK, {"strands": (2_000,)}, {QUICK: "sun"}, _LITTLE
-    frames = [base] + [replace(base, **{name: x}) for name, xs in axes.items() for x in xs]
+    frames = [base, *(replace(base, **{name: x}) for name, xs in axes.items() for x in xs)]
+    if args.full:
+        frames, fits = [], {FULL: ALL}
     rows: list[dict[str, Any]] = []
     for k, size in enumerate([*frames, *fits]):
         fit = k >= len(frames)
@@ -227,20 +243,28 @@ def _fit(size: Size, seed: int, stages: str, options: dict[str, Any]) -> list[di
 def _shoot(size: Size, seed: int, capture: Path, model: Path) -> None:
     """Write the capture of a simulated rig, and a model with its true strands."""
     rig, subject = size.rig(), size.subject(seed)
-    responder = MitsubaResponder(rig, subject, Drift(1, 0.0, seed), Quality.scaled(SPP), seed)
+    small = replace(size, side=size.side // size.block).rig()
+    responder = MitsubaResponder(small, subject, Drift(1, 0.0, seed), Quality.scaled(SPP), seed)
     steps = [Step(i, "olat", 0.02, light=x.name) for i, x in enumerate(rig.lights)]
     plan = {"steps": [s.to_dict() for s in steps]}
     writer = CaptureWriter.create(capture, rig, plan, head=subject.head)
     made = Model(model).create()
     made.write_strands(subject.strands)
-    for camera in rig.cameras:
+    for camera in small.cameras:
         response = responder.lights(camera.name)
         for step in steps:
             image = np.zeros((camera.height * camera.width, 3), np.float32)
             image[response.pixels] = response.image(step.index)
-            writer.write_frame(step, camera.name, image.reshape(camera.height, camera.width, 3))
-        made.write_mask(camera.name, "hair", coverage(responder._scene, camera)["hair"] > 0.5)
+            shape = (camera.height, camera.width, 3)
+            writer.write_frame(step, camera.name, _enlarged(image.reshape(shape), size.block))
+        hair = coverage(responder._scene, camera)["hair"] > 0.5
+        made.write_mask(camera.name, "hair", _enlarged(hair, size.block))
     writer.finish("completed", {})
+
+
+def _enlarged(image: NDArray[Any], block: int) -> NDArray[Any]:
+    """Each pixel of `image (H, W, ...)` as `block`² equal ones."""
+    return image.repeat(block, axis=0).repeat(block, axis=1)
 
 
 def _command(arguments: Sequence[str]) -> dict[str, Any]:
@@ -262,4 +286,6 @@ def _child(code: str) -> dict[str, Any]:
     return found
 
 
-BENCHMARK = Benchmark(run)
+BENCHMARK = Benchmark(
+    run, (option("--full", "only the fit of a capture of GroomLight's size", action="store_true"),)
+)

@@ -20,7 +20,7 @@ def test_the_table_has_estimated_over_measured():
 
 @pytest.mark.slow
 def test_a_quick_run_measures_frames_and_a_fit_beside_their_estimates(tmp_path):
-    args = argparse.Namespace(quick=True, out=tmp_path, seed=0)
+    args = argparse.Namespace(quick=True, full=False, out=tmp_path, seed=0)
     result = BENCHMARK.run(args, silent)
     assert json.loads((tmp_path / "cost.json").read_text()) == result
     assert [x["job"] for x in result["rows"]] == ["frames", "frames", "fit, sun"]
