@@ -48,7 +48,7 @@ def merged(results: Sequence[Mapping[str, Any]]) -> str:
         "Frames of dyed hair (dark roots, fair tips, wisps of two dyes) under held-out lights. dB",
         "without noise in held-out views ± spread over seeds of the fit / in training views / SSIM",
         "in held-out views; then how many seeds keep the stage. If none does, its row repeats the",
-        f"one above. Hair only, {rig['size']}²: {rig['cameras'] - 2} training and 2 held-out views,",
+        f"one above. Hair only, {rig['size']}²: {rig['cameras'] - 2} training, 2 held-out views,",
         f"{rig['lights'] // 2} training and {rig['lights'] - rig['lights'] // 2} held-out lights.",
     ]
     for ladder, title in LADDERS.items():
