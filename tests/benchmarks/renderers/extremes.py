@@ -27,7 +27,8 @@ class Extreme:
 
 
 def extremes(subject: Subject, lights: Sequence[Light]) -> list[Extreme]:
-    """The subject, with one thing changed at a time."""
+    """The subject in its mean colour, with one thing changed at a time."""
+    subject = replace(subject, absorption=None)
 
     def hair(name: str, **changed: object) -> Extreme:
         appearance = HairAppearance.from_dict(subject.hair.to_dict() | changed)
