@@ -63,6 +63,7 @@ def render_scanlines(
     rows within the line's blur (`Projector.row_weight`), so one pass renders the sweep. The sum
     over rows is the projector with all rows on. `rows` limits a projector to a range. `options`:
     see `ScanlineOptions`. For a moved subject, give the camera and projectors `moved` inversely.
+    Fibres scatter the mean of the BSDF over parts of their width (`mean_over_width`).
     """
     sweep = _sweep(projectors, rows)
     index = covered_pixels(scene, camera) if pixels is None else pixel_indices(camera, pixels)
@@ -126,7 +127,7 @@ class _Plan:
     def render(self, index: Ints, spp: int, seed: tuple[int, int]) -> dict[str, Floats]:
         """Mean over `spp` paths a pixel: `(rows, P, 3)` by projector."""
         n = len(index)
-        surface, slots = Surface(self.scene), opaque_index(n)
+        surface, slots = Surface(self.scene, mean_width=True), opaque_index(n)
         gathers = [
             _Gather(surface, dr.zeros(mi.Float, 3 * len(rows) * n), slots, p, rows, dim)
             for (p, rows), dim in zip(self.sweep, self.dim, strict=True)
