@@ -197,7 +197,7 @@ def test_pixels_without_strands_do_not_lighten_the_hair(wisp):
     assert 0.3 < len(kept.hair[0].pixels) / len(o.pixels) < 0.75
     start = scene.with_hair(replace(truth, sigma_a=(0.5, 0.5, 0.5)))
     found, lighter = (
-        fit_colour(start, p, sampling=replace(SAMPLING, spp=64)) for p in (kept, fitted_pixels)
+        fit_colour(start, p, sampling=replace(SAMPLING, spp=256)) for p in (kept, fitted_pixels)
     )
     np.testing.assert_allclose(found.hair.sigma_a, truth.sigma_a, rtol=0.15)
     assert np.max(np.divide(lighter.hair.sigma_a, truth.sigma_a)) < 0.8
@@ -228,7 +228,7 @@ def test_colours_are_compared_under_lights_before_the_hair(brighter_behind):
     behind = o.under(np.flatnonzero(cosines_of_lights(scene, o) < 0))
     assert in_front(FitPixels([behind]), scene).hair[0] is behind
     found, by_all = (
-        np.array(fit_colour(scene, x, sampling=replace(SAMPLING, spp=64)).hair.sigma_a)
+        np.array(fit_colour(scene, x, sampling=replace(SAMPLING, spp=256)).hair.sigma_a)
         for x in (front, fitted_pixels)
     )
     assert (found > 1.01 * by_all).all()
