@@ -50,6 +50,8 @@ def merged(results: Sequence[Mapping[str, Any]]) -> str:
         "in held-out views; then how many seeds keep the stage. If none does, its row repeats the",
         f"one above. Hair only, {rig['size']}²: {rig['cameras'] - 2} training, 2 held-out views,",
         f"{rig['lights'] // 2} training and {rig['lights'] - rig['lights'] // 2} held-out lights.",
+        f"A column's run: `--size {rig['size']} --ladders LADDER --seeds SEEDS --subject SUBJECT`,",
+        "at its commit; of reconstructed strands with `--strands FILE`.",
     ]
     for ladder, title in LADDERS.items():
         columns = {
