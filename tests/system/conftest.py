@@ -110,6 +110,7 @@ class TinyStage:
         """Start the simulated rig."""
         state = self.folder / "simulated"
         words: list[str | Path] = ["simulate", "--rig", self.rig, "--state", state]
+        words += ["--spp", "512"]  # frames take long enough to be waited for
         words += ["--subject", self.folder / "subject.npz", "--head", self.folder / "head.obj"]
         words += ["--truth", self.folder / "truth"]
         if faults is not None:

@@ -93,6 +93,7 @@ def add(commands: Commands) -> None:
     simulate.add_argument("--state", type=Path, default=Path("runs/simulated"), help="state folder")
     simulate.add_argument("--truth", type=Path, help="folder for the true strands and appearance")
     simulate.add_argument("--faults", type=Path, help="JSON list of faults to inject")
+    simulate.add_argument("--spp", type=int, help="paths a pixel of frames (default: 16)")
     simulate.add_argument(
         "--ports", choices=("auto", "rig"), default="auto", help="free TCP ports, or the rig file's"
     )
@@ -232,9 +233,9 @@ def run_simulate(args: argparse.Namespace, output: Output) -> int:
 
     exit_on_sigterm()
     more = ["--state", args.state, "--ports", args.ports]
-    for option in ("truth", "faults"):
+    for option in ("truth", "faults", "spp"):
         if getattr(args, option) is not None:
-            more += [f"--{option}", getattr(args, option)]
+            more += [f"--{option}", str(getattr(args, option))]
     simulated = SimulatedRig(args.rig, args.subject, args.head, args.seed)
     with Children(args.state / "logs") as children:
         child = children.start("simulators", simulated.command(*more), to_log=False, pipe=True)
