@@ -51,8 +51,9 @@ def check_tree(quick: bool) -> str:
 
 
 def commit_of_tree() -> str:
-    """The commit of this checkout. Raises `NotPublished` outside of one."""
-    return _git("rev-parse", "--short=12", "HEAD")
+    """The commit of this checkout, "-dirty" where files differ from it. Raises `NotPublished`
+    outside of one."""
+    return _git("describe", "--always", "--exclude=*", "--abbrev=12", "--dirty")
 
 
 def publish(

@@ -57,13 +57,12 @@ def test_over_all_offsets_it_is_the_near_fields_mean_over_each_part_of_the_width
     wi = reference.direction(theta_i[:, None], np.arcsin(h))
     wo = reference.direction(theta_o[:, None], np.arcsin(h) + turn[:, None])
     want = [reference.evaluate(Fibre(s, beta_m, beta_n, 1.55, tilt), wi, wo) for s in sigma_a]
-    on_device = (mi.Vector3f(*x.reshape(-1, 3).T) for x in (wi, wo))
-    one, other = on_device
+    one, other = (mi.Vector3f(*x.reshape(-1, 3).T) for x in (wi, wo))
     got = mean_over_width(Fibre(mi.Color3f(*sigma_a), beta_m, beta_n, 1.55, tilt), one)(other)
     mean = np.array(got).reshape(3, count, offsets).mean(axis=2)
-    np.testing.assert_allclose(mean, np.mean(want, axis=2), rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(mean, np.mean(want, axis=2), rtol=1e-5, atol=1e-8)
     spread = np.array(got).reshape(3, count, offsets).std(axis=2).mean()
-    assert spread < 0.5 * np.std(want, axis=2).mean()
+    assert spread < 0.4 * np.std(want, axis=2).mean()
 
 
 def test_directions_along_the_fibre_and_on_its_edges_are_finite():

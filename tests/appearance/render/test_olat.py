@@ -9,6 +9,7 @@ import pytest
 from benchmarks.renderers.path_reference import PathReference
 
 from appearance import HairAppearance, build_scene, render_olat
+from appearance.bsdf.maps import HairMaps, MappedStrands
 from appearance.render import olat
 from appearance.render.coverage import covered_pixels
 from appearance.render.olat import render_direct, render_indirect
@@ -183,23 +184,27 @@ def test_indirect_light_is_what_direct_light_lacks(small, tufted):
 
 
 @pytest.mark.parametrize(
-    ("light", "spp", "noise"),
+    ("light", "spp", "noise", "colours"),
     [
-        pytest.param(partial(render_indirect, max_depth=6), 64, 0.75, marks=pytest.mark.slow),
-        (render_direct, 36, 0.6),
+        pytest.param(
+            partial(render_indirect, max_depth=6), 64, 0.75, False, marks=pytest.mark.slow
+        ),
+        (render_direct, 36, 0.6, False),
+        (render_direct, 36, 0.6, True),
     ],
 )
 def test_fibres_that_scatter_the_mean_of_a_part_of_their_width(
-    small, monkeypatch, light, spp, noise
+    small, monkeypatch, light, spp, noise, colours
 ):
     """Beside fibres that scatter as at the hit: the same light, and less noise."""
     strands = small.tuft()
     dense = replace(strands, radius=3 * strands.radius)
-    scene, camera, lights = (
-        build_scene(dense, small.plane(), hair=HAIR),
-        small.camera(),
-        small.lights(),
-    )
+    scene = build_scene(dense, small.plane(), hair=HAIR)
+    if colours:
+        absorption = np.random.default_rng(0).uniform(0.05, 1, (1, len(dense), 3))
+        maps = HairMaps.each(HAIR, absorption)
+        scene = MappedStrands.alone(scene, dense).with_maps(maps)
+    camera, lights = small.camera(), small.lights()
     pixels = covered_pixels(scene, camera)
 
     def pictures():

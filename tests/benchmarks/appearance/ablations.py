@@ -30,7 +30,7 @@ from benchmarks.appearance.known_subjects import (
     known_subject,
     on_reconstructed,
 )
-from benchmarks.appearance.merged import figures_of, merged
+from benchmarks.appearance.merged import figures_of, merged, read_results
 from benchmarks.appearance.table import GROUPS, Table
 from benchmarks.command import CAPTURE, SUBJECT, Benchmark, LeftOut, cycles_folder, option, within
 from benchmarks.publish import commit_of_tree
@@ -38,7 +38,6 @@ from benchmarks.results import markdown, save, spread
 from benchmarks.subjects import Subject, simulated
 from reconstruction import Progress, read_strands, silent
 from reconstruction.arrays import Array
-from reconstruction.reading import parse_json
 
 OPTIONS = InverseRenderingOptions(
     free_index=True,
@@ -333,9 +332,10 @@ SMALL = SmallStage(size=14, cameras=3, lights=6, spp=64, max_depth=4)
 
 def _bench(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.results:
-        results = [parse_json(path.read_bytes()) for path in args.results]
+        results = read_results(args.results)
         (args.out / "appearance.md").write_text(merged(results))
-        return {"seeds": args.seeds, "runs": [figures_of(r) for r in results]}
+        fits = sorted({name.split()[-1] for r in results for name in r["subjects"]})
+        return {"seeds": ", ".join(fits), "runs": [figures_of(r) for r in results]}
     subject = simulated(args.rig, args.subject, args.head, args.seed)
     if args.size in AT_SIZE and not args.quick:
         runs = Ladders(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from benchmarks.appearance.known_subjects import RECONSTRUCTED
 from benchmarks.appearance.table import GROUPS, TRUTH
 from benchmarks.results import markdown
+from reconstruction.reading import parse_json
+from stage_service.cli.support.commands import BadArgument
 
 LADDERS = {
     RECONSTRUCTED: "Reconstructed strands",
@@ -39,6 +42,33 @@ _ERRORS = {
 }
 Run = Mapping[str, Any]
 """Variants of one seed of the fit."""
+
+
+def read_results(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """`appearance_SIZE.json` of runs. Raises `BadArgument` for other files and for a column that
+    two of them have."""
+    wanted = "give appearance_SIZE.json of 'hairstage bench appearance --size SIZE'"
+    found, columns = [], set[tuple[str, ...]]()
+    for path in paths:
+        try:
+            result = parse_json(path.read_bytes())
+            if not merged([result]).count("## "):
+                raise ValueError("no runs")
+        except OSError as e:
+            raise BadArgument(f"{path} cannot be read ({e.strerror}): {wanted}") from e
+        except (ValueError, TypeError, KeyError, AttributeError) as e:
+            what = f"it has no {e}" if isinstance(e, KeyError) else e
+            raise BadArgument(f"{path} is not a run's ({what}): {wanted}") from e
+        for ladder in {name.split(",")[0] for name in result["subjects"]}:
+            column = (ladder, result["subject"], result["commit"])
+            if column in columns:
+                raise BadArgument(
+                    f"{path} has ladder {ladder} of {result['subject']} at {result['commit']}, "
+                    "as another file has: give one of them"
+                )
+            columns.add(column)
+        found.append(result)
+    return found
 
 
 def merged(results: Sequence[Mapping[str, Any]]) -> str:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from benchmarks.appearance.merged import VARIANTS, figures_of, merged
+import json
+
+import pytest
+from benchmarks.appearance.merged import VARIANTS, figures_of, merged, read_results
+
+from stage_service.cli.support.commands import BadArgument
 
 
 def _variant(held: float, kept: bool | None, off: float) -> dict[str, object]:
@@ -47,3 +52,20 @@ def test_published_figures_are_those_of_the_tables():
     figures = figures_of(_result("wavy", "r", 1) | {"options": {"seed": 3}})
     assert set(figures) == {"subject", "commit", "subjects"}
     assert merged([figures | {"rig": {"size": 128, "cameras": 10, "lights": 48}}])
+
+
+def test_files_that_are_no_runs_and_a_run_given_twice_are_refused(tmp_path):
+    run, page, text = (tmp_path / name for name in ("run.json", "page.json", "text.json"))
+    run.write_text(json.dumps(_result("wavy", "r", 1)))
+    page.write_text(json.dumps({"figures": {}}))
+    text.write_text("# a page")
+    assert len(read_results([run])) == 1
+    for path, reason in (
+        (page, "it has no 'rig'"),
+        (text, "Expecting value"),
+        (tmp_path / "x", "No such"),
+    ):
+        with pytest.raises(BadArgument, match=f"{path.name}.*{reason}.*give appearance_SIZE.json"):
+            read_results([path])
+    with pytest.raises(BadArgument, match=r"ladder r of wavy at abc.*give one of them"):
+        read_results([run, run])
