@@ -44,7 +44,8 @@ class SerialLines:
 
     After a missed deadline or a broken reply the port is closed. The next request opens it, drops
     late input and reads until the device has identified itself, so that a late reply is never taken
-    for a later one's. Echoed requests and empty lines are dropped.
+    for a later one's. If that identity was itself a late one, the replies to this identification
+    follow it and are dropped, too, as are echoed requests and empty lines.
     """
 
     def __init__(self, name: str, config: SerialConfig, identity: Identity) -> None:
@@ -52,6 +53,7 @@ class SerialLines:
         self.config = config
         self._identity = identity
         self._port: ExclusivePort | None = None
+        self._error_pending = False  # the reply to the identification's "?" is still to come
         self._lock = threading.RLock()
 
     def connect(self) -> re.Match[str]:
@@ -142,6 +144,7 @@ class SerialLines:
         # "?" ends a request that was cut off in the device's buffer.
         own = ("?", "ID?")
         self._send("\n".join(own), doing)
+        self._error_pending = True
         deadline = time.monotonic() + self.config.timeout_s
         for _ in range(MOST_LINES):
             try:
@@ -152,6 +155,8 @@ class SerialLines:
                 break
             if match := self._identity.pattern.fullmatch(line):
                 return match
+            if line.startswith("ERR 1"):
+                self._error_pending = False
             if line and (line not in own or found in ("", *own)):
                 found = line
         self.close()
@@ -167,7 +172,7 @@ class SerialLines:
         return "This is another device: check the ports in the rig file."
 
     def _reply(self, request: str, deadline: float, doing: str) -> str:
-        """The first line that is neither empty, nor an echo, nor a late identity."""
+        """The first line that is neither empty, an echo, nor a reply to the identification."""
         echoed = False
         while True:
             try:
@@ -179,6 +184,9 @@ class SerialLines:
                 kind, todo = DeviceTimeout, f"{_ECHOES} Check the device's power and cable."
                 raise self._error(kind, doing, "a reply", received, todo) from error
             echo, echoed = line == request, echoed or line == request
+            if self._error_pending and line.startswith("ERR 1"):
+                self._error_pending = False
+                continue
             if line and not echo and not self._identity.pattern.fullmatch(line):
                 return line
 

@@ -80,6 +80,23 @@ def test_serial_ports_that_are_not_there_or_another_device(rig_file, world):
     controller.close()
 
 
+def test_an_identity_that_comes_late_does_not_shift_the_replies(rig_file, world, slack):
+    assert rig_file.devices is not None
+    world.late, world.pulses = ["ID?"], 7
+    port = rig_file.devices.trigger.port
+    box = SerialTriggerBox(SerialConfig(port=port, timeout_s=0.2 * slack))
+    with pytest.raises(DeviceError, match="identifying: expected a trigger box"):
+        box.connect()
+    box.connect()  # reads the first identity, then the replies to this connection's requests
+    assert box.count() == 7
+    world.pulses, world.estop = 8, True
+    assert box.count() == 8
+    assert box.status().estop_pressed
+    with pytest.raises(DeviceError, match="ERR 1 unknown command"):
+        box._lines.request("NOTHING", "OK", "sending an unknown command")
+    box.close()
+
+
 def test_a_device_that_talks_on_and_on_is_given_up_at_its_deadline():
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
