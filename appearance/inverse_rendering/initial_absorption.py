@@ -80,15 +80,16 @@ def visible_cells(problem: FitProblem, o: Observed, shape: Shape, seed: int) -> 
     si = surface.interact(ray, mi.Bool(True))
     hair = si.is_valid() & surface.is_hair(si)
     on_strand = StrandHit(problem.mapped.coordinates, si, hair)
-    along = np.array(dr.select(hair, on_strand.along, 0))
-    strand = np.array(dr.select(hair, on_strand.strand, 0))
+    found = hair, dr.select(hair, on_strand.along, 0), dr.select(hair, on_strand.strand, 0)
+    dr.eval(found)  # one tracing for the three
+    met, along, strand = map(np.array, found)
     layers, columns, rows = shape
     u, v = problem.mapped.root_uv[strand].T
     column = np.minimum((u * columns).astype(int), columns - 1)
     row = np.minimum((v * rows).astype(int), rows - 1)
     layer = np.rint(along * (layers - 1)).astype(int)
     cell = (layer * columns + column) * rows + row
-    return np.where(np.array(hair), cell, -1).reshape(-1, _RAYS)
+    return np.where(met, cell, -1).reshape(-1, _RAYS)
 
 
 def _mean(o: Observed, values: Array) -> Array:

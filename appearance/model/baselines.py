@@ -144,12 +144,11 @@ def first_hits(scene: HairScene, camera: Camera, mask: Bools) -> tuple[Array, Bo
     ray = camera_rays(camera, mi.Float(column + 0.5), mi.Float(row + 0.5))
     surface = Surface(scene)
     si = surface.interact(ray, mi.Bool(True))
-    valid = si.is_valid()
-    shape = mask.shape
-    met, hair = (
-        np.array(x, dtype=bool).reshape(shape) for x in (valid, valid & surface.is_hair(si))
-    )
-    depth = np.array(dr.select(valid, si.t, 0), dtype=float).reshape(shape) / SCALE
+    valid, shape = si.is_valid(), mask.shape
+    found = valid, valid & surface.is_hair(si), dr.select(valid, si.t, 0)
+    dr.eval(found)  # one tracing for the three
+    met, hair, depth = (np.array(x).reshape(shape) for x in found)
+    depth = depth.astype(float) / SCALE
     if hair.any():
         nearest = distance_transform_edt(~hair, return_distances=False, return_indices=True)
         depth = np.where(mask & ~hair, depth[tuple(nearest)], depth)

@@ -36,7 +36,7 @@ def relight(
     """
     scene, camera = fitted.scene(), three_quarter_view(fitted.strands, size)
     radiance = environment_smoothed(scene, camera, envmap, replace(SHOWN, spp=spp, seed=seed))
-    share = coverage(scene, camera)
+    share = coverage(scene, camera, 4)
     subject = share["hair"] + share["head"] > 0.5
     shown = radiance[subject] if subject.any() else radiance  # sparse hair fills no pixel
     with model.writing("relit.exr") as part:

@@ -40,11 +40,11 @@ def pixel_coverage(
     pi = scene.mi_scene.ray_intersect_preliminary(paths.rays, coherent=True)
     hit = pi.is_valid()
     hair = hit & surface.is_hair(pi)
-    out = {}
+    counts = {name: dr.zeros(mi.UInt32, size) for name in ("hair", "head")}
     for name, mask in (("hair", hair), ("head", hit & ~hair)):
-        count = dr.zeros(mi.UInt32, size)
-        dr.scatter_add(count, mi.UInt32(1), paths.slot, mask)
-        out[name] = np.array(count, dtype=np.float32) / np.float32(spp)
+        dr.scatter_add(counts[name], mi.UInt32(1), paths.slot, mask)
+    dr.eval(counts)  # one tracing for both
+    out = {name: np.array(x, np.float32) / np.float32(spp) for name, x in counts.items()}
     return out
 
 

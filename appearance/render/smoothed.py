@@ -47,7 +47,12 @@ DIRECT = 36
 """Least number of paths a pixel of direct light, each a quarter of the cost of a full path."""
 THRIFT = 6.0
 """`OlatOptions.thrift` of indirect light: 0.1 dB less than at 3, for a fifth less time."""
-_DIRECT_OF_MAPS = 6
+_DIRECT_OF_MAPS = 10.0
+"""Paths a pixel of a map's direct light over the square root of those of indirect light: three
+times less error than that of indirect light, which falls slowly with paths."""
+_SIGMA_OF_MAPS, _NARROWER = 3.2, 0.3
+"""Filter of a map's indirect light at one path a pixel, and the power by which paths narrow it.
+Within 0.2 dB of the least error from 1 to 32 paths, on pixels of 0.5 and 1.9 mm."""
 SHOWN = Sampling(36, 16)
 
 
@@ -132,19 +137,19 @@ def environment_smoothed(
 ) -> Floats:
     """`render_environment` with its indirect light smoothed: `(H, W, 3)`.
 
-    `envmap (h, w, 3)`. Smoothed over `SIGMA` pixels, or 1/160 of the width of large images. Direct
-    light has `_DIRECT_OF_MAPS` times `spp` paths a pixel; light that only one half of them sampled
-    is spread (`without_rare`).
+    `envmap (h, w, 3)`. The more paths, the narrower the filter: 3.2 pixels at one path a pixel, 1.1
+    at 32. Direct light has `_DIRECT_OF_MAPS` times the square root of `spp` paths a pixel; light
+    that only one half of them sampled is spread (`without_rare`).
     """
     spp, seed = sampling.spp, sampling.seed
-    share = coverage(scene, camera, max(spp, 16), seed)
+    share = coverage(scene, camera, seed=seed)
     index = np.flatnonzero((share["hair"] + share["head"]).ravel() > 0)
     indirect = indirect_environment(scene, camera, envmap, sampling, index)
-    half = _DIRECT_OF_MAPS * spp // 2
+    half = round(_DIRECT_OF_MAPS * spp**0.5 / 2)
     one, other = (
         direct_environment(scene, camera, envmap, half, 2 * seed + k, pixels=index) for k in (1, 2)
     )
-    sigma = max(SIGMA, camera.width / 160)
+    sigma = _SIGMA_OF_MAPS * spp**-_NARROWER
     # a field has the detail of single strands: what is smooth is the light without it
     factor = mean_factor(scene, camera, envmap, index)
     smooth = smoothed((indirect / factor)[None], share, sigma)[0]
