@@ -20,5 +20,5 @@ class AssessOptions:
     lights: Count = 5
     spp: Count = 24
     relit_size: Count = 640
-    relit_spp: Count = 4
+    relit_spp: Count = 6
     turning_frames: Annotated[int, Field(ge=0, le=1000)] = 0
