@@ -53,7 +53,7 @@ class SerialLines:
         self.config = config
         self._identity = identity
         self._port: ExclusivePort | None = None
-        self._error_pending = False  # the reply to the identification's "?" is still to come
+        self._errors_pending = 0  # replies to identifications' "?" that may still come
         self._lock = threading.RLock()
 
     def connect(self) -> re.Match[str]:
@@ -144,7 +144,7 @@ class SerialLines:
         # "?" ends a request that was cut off in the device's buffer.
         own = ("?", "ID?")
         self._send("\n".join(own), doing)
-        self._error_pending = True
+        self._errors_pending += 1
         deadline = time.monotonic() + self.config.timeout_s
         for _ in range(MOST_LINES):
             try:
@@ -155,8 +155,8 @@ class SerialLines:
                 break
             if match := self._identity.pattern.fullmatch(line):
                 return match
-            if line.startswith("ERR 1"):
-                self._error_pending = False
+            if self._errors_pending and line.startswith("ERR 1"):
+                self._errors_pending -= 1
             if line and (line not in own or found in ("", *own)):
                 found = line
         self.close()
@@ -184,10 +184,10 @@ class SerialLines:
                 kind, todo = DeviceTimeout, f"{_ECHOES} Check the device's power and cable."
                 raise self._error(kind, doing, "a reply", received, todo) from error
             echo, echoed = line == request, echoed or line == request
-            if self._error_pending and line.startswith("ERR 1"):
-                self._error_pending = False
-                continue
-            if line and not echo and not self._identity.pattern.fullmatch(line):
+            if self._errors_pending and line.startswith("ERR 1"):
+                self._errors_pending -= 1
+            elif line and not echo and not self._identity.pattern.fullmatch(line):
+                self._errors_pending = 0  # replies come in order
                 return line
 
     def _send(self, request: str, doing: str) -> None:
