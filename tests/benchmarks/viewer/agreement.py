@@ -6,7 +6,7 @@ path tracer's is white.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,15 +58,14 @@ class Row:
 
 def compare(
     shown: Shown, scene: HairScene, effort: Effort, progress: Progress
-) -> tuple[dict[str, dict[str, float]], Array]:
-    """Figures by light, and a picture `(H, W, 3)`, 8 bits: each light a row, the path tracer's, the
-    viewer's, then direct light of both."""
+) -> Iterator[tuple[str, dict[str, float], Array]]:
+    """Of one light after another its name, figures and a picture `(H, 4 W, 3)`, 8 bits: the path
+    tracer's, the viewer's, then direct light of both."""
     camera = shown.camera(effort.size)
     hair = coverage(scene, camera)["hair"] > 0.5
-    figures: dict[str, dict[str, float]] = {}
-    pictures, lit = list[Array](), None
-    for name, row in _traced(scene, camera, shown.lights(), effort).items():
-        progress(name, 0.2 * len(figures))
+    lit = None
+    for k, (name, row) in enumerate(_traced(scene, camera, shown.lights(), effort)):
+        progress(name, 0.2 * k)
         exposure = Exposure.of([_mean(row.whole)[hair]])
         if row.what != lit:
             shown.light(row.what)
@@ -74,14 +73,14 @@ def compare(
                 shown.at_rest(effort.size, effort.over, effort.samples, a) for a in (0.0, None)
             )
             lit = row.what
-        figures[name] = {
+        figures = {
             **_judged("", whole, row.whole, exposure, hair),
             **_judged("direct_", direct, row.direct, exposure, hair),
             "direct_share": float(_mean(row.direct)[hair].sum() / _mean(row.whole)[hair].sum()),
         }
         drawn = (_mean(row.whole), whole, _mean(row.direct), direct)
-        pictures.append(np.hstack([exposure(x) for x in drawn]))
-    return figures, np.rint(255 * np.vstack(pictures)).astype(np.uint8)
+        picture = np.hstack([exposure(x) for x in drawn])
+        yield name, figures, np.rint(255 * picture).astype(np.uint8)
 
 
 def _judged(
@@ -110,7 +109,7 @@ def _mean(halves: Halves) -> Floats:
 
 def _traced(
     scene: HairScene, camera: Camera, lights: list[Light], effort: Effort
-) -> dict[str, Row]:
+) -> Iterator[tuple[str, Row]]:
     """From before, from the side, from behind, an environment map, and that of the rig's lights."""
     ways = np.array([x.position / np.linalg.norm(x.position) for x in lights])
     eye = camera.center / np.linalg.norm(camera.center)
@@ -147,14 +146,12 @@ def _traced(
         )
         return np.einsum("lhwc,lc->hwc", olat, weights)
 
-    rows = {}
     direct, whole = twice(single)
     for i, (name, number) in enumerate(numbers.items()):
-        rows[name] = Row({number: [1, 1, 1]}, tuple(direct[:, i]), tuple(whole[:, i]))
+        yield name, Row({number: [1, 1, 1]}, tuple(direct[:, i]), tuple(whole[:, i]))
     for name, render in ((STUDIO, mapped), (f"{STUDIO}, as lights", summed)):
         direct, whole = twice(render)
-        rows[name] = Row(STUDIO, tuple(direct), tuple(whole))
-    return rows
+        yield name, Row(STUDIO, tuple(direct), tuple(whole))
 
 
 def write(path: Any, picture: Array) -> None:

@@ -1,6 +1,6 @@
 """The viewer: how near its light is to the path tracer's, and how fast it draws.
 
-Leaves `viewer.json` and a picture of each groom.
+Leaves `viewer.json` and a picture of each groom, written after each light.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from benchmarks.viewer.agreement import Effort, compare, write
 from benchmarks.viewer.page import viewers
 from benchmarks.viewer.speed import measure
 from reconstruction import Progress
+from reconstruction.arrays import Array
 from stage_service.cli.support.commands import rig_path
 
 GROOMS: tuple[str, ...] = ("straight", "wavy", "curly")
@@ -45,12 +46,14 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         for k, (name, subject) in enumerate(subjects.items()):
             begin = time.monotonic()
             part = within(progress, name, 0.3 * k, 0.3)
+            result["agreement"][name], pictures = {}, list[Array]()
             with opened(subject) as shown:
-                figures, picture = compare(shown, subject.scene(), effort, part)
-            result["agreement"][name] = figures
+                for light, figures, picture in compare(shown, subject.scene(), effort, part):
+                    pictures.append(picture)
+                    result["agreement"][name][light] = figures
+                    write(args.out / f"viewer_{name}.png", np.vstack(pictures))
+                    save(args.out / "viewer.json", result)
             result["agreement"][name]["seconds"] = time.monotonic() - begin
-            write(args.out / f"viewer_{name}.png", picture)
-            save(args.out / "viewer.json", result)
         for count in counts:
             progress(f"{count} strands", 0.95)
             some = next(iter(subjects.values()))
