@@ -351,13 +351,14 @@ class _Probe:
         step = min(self.options.light_codes.search.step, STEP_PIXELS * self.pixel)
         depths = 0.4 + 0.6 * 5e-4 / step
         words = -(-lights // WORD)  # of a lightcode
-        each = DEPTHS * (1 + 0.5 * words) * depths * 2 / (os.cpu_count() or 2)
+        cores = len(os.sched_getaffinity(0))
+        each = DEPTHS * (1 + 0.5 * words) * depths * 2 / cores
         add("depth", 0.0, each * hair * near, 2.5e-7 * hair)
         lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # wide pixels agree less
         if method == "lmvs":
             lines *= 0.03
         found, lines = lines, min(lines, MOST_LINES)
-        add("segments", 0.0, (4e-7 + 5e-8 / (os.cpu_count() or 2) * cameras) * hair, 5e-7 * hair)
+        add("segments", 0.0, (4e-7 + 5e-8 / cores * cameras) * hair, 5e-7 * hair)
         add("connection", 0.0, 5e-6 * found + 8e-5 * lines, 5e-7 * hair)
         return found, lines
 

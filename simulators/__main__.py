@@ -148,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--processes",
         type=int,
-        default=min(os.cpu_count() or 1, 4),
+        default=min(len(os.sched_getaffinity(0)), 4),
         help="rendering processes; frames do not depend on their number (default: %(default)s)",
     )
     parser.add_argument(

@@ -103,7 +103,7 @@ def grow_from_roots(
             out.append(path.copy() if near else np.vstack([root[None], path]))
         return out
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         parts = pool.map(some, range(0, len(at), _TOGETHER))
         return [path for part in parts for path in part]
 

@@ -11,7 +11,7 @@ from reconstruction import CaptureWriter, Rig, Step
 from reconstruction.capture.records import FrameRecord
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
-THREADS = (os.cpu_count() or 1) + 2
+THREADS = len(os.sched_getaffinity(0)) + 2
 """Threads that convert, hash and write: one per processor, one that waits for the disk's writes and
 one for its flushes."""
 FEWEST_STEPS, MOST_STEPS = 2, 8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -77,6 +78,12 @@ class Viewed:
         from stage_service.viewer.lighting import Lighting
 
         return Lighting(self.model, self.capture, self._packed)
+
+    def prepare(self) -> None:
+        """Load and compile what the first light needs; nothing without a fit. Raises nothing."""
+        with suppress(Exception):  # the first light's own request reports it
+            if self.model.has("appearance.json"):
+                self.lighting.visibility(0)
 
     def about(self) -> dict[str, Any]:
         """Contents, JSON-ready: sets of strands, head, confidence, cameras."""

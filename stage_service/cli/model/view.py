@@ -35,6 +35,7 @@ def run(args: argparse.Namespace, output: Output) -> None:
     printed address contains a key: anyone who has it can view the model.
     """
     import secrets
+    import threading
 
     from reconstruction import Capture, Model, read_strands
     from stage_service.api.app import serve_viewer
@@ -56,7 +57,9 @@ def run(args: argparse.Namespace, output: Output) -> None:
     name = args.model.resolve().name
     decoder = Decoder()
     viewing = Viewing(lambda: [name], lambda _: Viewed(model, capture, truth), decoder)
-    viewing.get(name).about()  # read before the browser opens
+    viewed = viewing.get(name)
+    viewed.about()  # read before the browser opens
+    threading.Thread(target=viewed.prepare).start()
     key = secrets.token_urlsafe(24)
 
     def ready(url: str) -> None:

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from appearance import FittedModel
 from appearance.inverse_rendering.fitted_lights import save_lights
-from reconstruction import Camera, Capture, CaptureWriter, Light, Rig, Step
+from reconstruction import Camera, Capture, CaptureWriter, Light, ModelError, Rig, Step
 from reconstruction.geometry.lights import dome_positions
 from stage_service.viewer.lighting import Lighting
 from stage_service.viewer.packing import PackedStrands
@@ -126,3 +127,20 @@ def test_all_lights_together_are_the_captured_frame_of_all(model, tmp_path):
     assert (found == np.rint(shown))[~near_half].all()
     assert near_half.mean() < 0.01
     assert 20 < found.mean() < 235
+
+
+def test_what_is_prepared_is_not_traced_again(model, monkeypatch):
+    FittedModel.unfitted(model).save(model)
+    viewed = Viewed(model)
+    viewed.prepare()
+    monkeypatch.setattr("stage_service.viewer.lighting.reached", None)
+    head, packed = viewed.head, viewed.packed("model")
+    assert len(viewed.lighting.visibility(0)) == packed.points[..., 0].size + len(head.vertices)
+
+
+def test_a_damaged_fit_stops_at_the_first_light_not_before(model):
+    (model.path / "appearance.json").write_text("{")
+    viewed = Viewed(model)
+    viewed.prepare()
+    with pytest.raises(ModelError):
+        viewed.lighting.visibility(0)
