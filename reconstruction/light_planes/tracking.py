@@ -255,7 +255,8 @@ def likeness(views: list[TrackedView], images: dict[str, Array], pose: Pose) -> 
             out.append(0.0)
             continue
         places = pixels[inside].T[::-1]
-        now = ndimage.map_coordinates(smooth(images[view.camera.name], SIGMA), places, order=1)
+        picture = smooth(images[view.camera.name], SIGMA)
+        now = ndimage.map_coordinates(picture, places, order=1, mode="nearest")
         value = view.reference[inside]
         now, value = now - now.mean(), value - value.mean()
         size = float(np.sqrt((now @ now) * (value @ value)))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from reconstruction import Camera, Capture, Projector, Stage
 from reconstruction.light_planes import Motion, solve_motion, triangulate
 from reconstruction.light_planes.registration import Template, gradients, sample, spline
+from reconstruction.light_planes.tracking import STILL, TrackedView, likeness
 from reconstruction.reconstruct_options import MotionOptions
 
 CORNERS = np.array(np.meshgrid([-0.07, 0.07], [-0.07, 0.07], [-0.07, 0.07])).reshape(3, -1).T
@@ -52,6 +53,17 @@ def test_registration_states_its_noise() -> None:
     spread = np.std([r.shift[0] for r in found])
     stated = np.mean([r.deviation[0] for r in found])
     assert 0.4 * stated < spread < 2.5 * stated
+
+
+def test_an_image_is_like_itself_to_its_edges() -> None:
+    """Points in the outer half of the outermost pixels, as where hair fills the image."""
+    camera = Camera.look_at("c", 30, 30, (0, -1, 0), (0, 0, 0), 10.0)
+    x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))
+    image = waves(x, y)
+    pixels = np.random.default_rng(0).uniform(-0.5, 29.5, (2000, 2))
+    points = camera.center + camera.rays(pixels)
+    view = TrackedView(camera, Template(image, np.ones((30, 30), bool)), points, pixels)
+    assert likeness([view], {"c": image}, STILL) == pytest.approx(1, abs=2e-3)
 
 
 def test_templates_without_mask_or_detail_raise_errors() -> None:
