@@ -39,6 +39,8 @@ from reconstruction.tangents.reflection import (
 
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
+MOST_DEVIATION = 10.0
+"""Median of `Tangents.deviation` above which most directions are more than 10° off."""
 TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
 MOST_POINTS = 250_000
 """At most so many points have directions: their scores and responses take about 6 GB under 331
@@ -227,9 +229,17 @@ def measure_tangents(
                 f"directions from reflection are unreliable: the highlight is {table.contrast:.2f} "
                 "times its surroundings, under 1.3"
             )
+    deviation = float(np.median(tangents.deviation))
+    if deviation > MOST_DEVIATION:
+        stage.warn(
+            f"directions are uncertain by {deviation:.0f}° in the median, over "
+            f"{MOST_DEVIATION:g}°, and their errors are larger: strands follow the flow of the "
+            "hair, not single hairs; pixels that are finer on the hair show more"
+        )
     stage.figures.update(
         points=len(points),
         apart_mm=1e3 * apart,
+        deviation_deg=deviation,
         cameras_per_point={
             str(k): int(n) for k, n in enumerate(np.bincount(visible.sum(axis=1))) if n
         },

@@ -120,6 +120,15 @@ class Tangents:
     directions: Array
     confidence: Array
 
+    @property
+    def deviation(self) -> Array:
+        """Standard deviation `(N,)`, degrees, of directions with that confidence c.
+
+        Of a normal distribution about one direction: the two smaller eigenvalues are the variance
+        s², so that c = 1 − 3 s².
+        """
+        return np.degrees(np.sqrt((1 - self.confidence) / 3))
+
 
 def decide(scores: AnyFloats, candidates: Array) -> Tangents:
     """The best direction for each row of `scores (N, D)` over `candidates (D, 3)`.

@@ -110,6 +110,17 @@ def test_a_line_along_the_ray_is_not_spoken_about() -> None:
     assert abs(along[0, 0]) < 1e-6
 
 
+@pytest.mark.parametrize("deg", [1.0, 6.0, 12.0])
+def test_deviation_is_that_of_the_directions_that_a_confidence_describes(deg: float) -> None:
+    """Drawn from a normal distribution about an axis; confidence as `Tangents` defines it."""
+    turns = np.random.default_rng(0).normal(0, np.radians(deg), (200_000, 2))
+    drawn = np.column_stack([np.tan(turns), np.ones(len(turns))])
+    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(drawn.T @ drawn / len(drawn))
+    found = Tangents(np.array([[0.0, 0, 1]]), np.array([values[2] - values[1]])).deviation
+    assert found == pytest.approx(deg, rel=0.05)
+
+
 def test_no_texture_gives_no_confidence() -> None:
     support = line_support(np.ones((8, 4, 4)))
     assert np.abs(support).max() == 0
