@@ -117,7 +117,9 @@ class PlacedBall:
         if used.sum() < FEWEST:
             return None
         place = pixels[used].T[::-1]
-        found = np.array([map_coordinates(c, place, order=1) for c in image.transpose(2, 0, 1)])
+        found = np.array(
+            [map_coordinates(c, place, order=1, mode="nearest") for c in image.transpose(2, 0, 1)]
+        )
         share = (cosine / squared)[used, None]
         sent = self.albedo / np.pi * light.intensity_towards(points[used]) * share
         observed = found.mean(axis=1)
