@@ -28,7 +28,7 @@ from reconstruction.reconstruct_options import ReconstructOptions
 from reconstruction.report.progress import ReportWithProgress
 from reconstruction.report.report import Progress, Report, silent
 from reconstruction.stages import MeasuringStages, Stages, method_for
-from reconstruction.tangents.estimate import Measured
+from reconstruction.tangents.estimate import MOST_DEVIATION, Measured
 
 FINE_PIXEL = 1e-3  # metres: line stereo fails on pixels twice as wide
 
@@ -165,9 +165,10 @@ class _Run:
     def hull(self, masked: MaskedCapture, cloud: PointCloud, head: FittedHead | None) -> None:
         """Strands along the smooth field of the hull's surface and all measured lines.
 
-        Single lights, photographs under constant light or patterns give directions, and line
-        stereo if pixels are at most `FINE_PIXEL` wide. Without either nothing is measured; without
-        a head no strand has a root.
+        Single lights, photographs under constant light or patterns give directions. Line stereo
+        adds lines if pixels are at most `FINE_PIXEL` wide and directions are uncertain: where they
+        are certain the cameras agree on the hull's surface, and lines beside it are mostly wrong.
+        Without light nothing is measured; without a head no strand has a root.
         """
         o, capture, report = self.stages.options, masked.capture, self.stages.report
         lit = bool(capture.olat_lights() or capture.without_single_lights())
@@ -189,6 +190,11 @@ class _Run:
             elif scale.pixel > FINE_PIXEL:
                 why = (
                     f"a pixel is {1e3 * scale.pixel:.1f} mm wide, more than {1e3 * FINE_PIXEL:g} mm"
+                )
+                stage.leave_out("line stereo", why, "its stages")
+            elif measured.deviation <= MOST_DEVIATION:
+                why = (
+                    f"directions on the hull are certain to {measured.deviation:.0f}° in the median"
                 )
                 stage.leave_out("line stereo", why, "its stages")
             else:

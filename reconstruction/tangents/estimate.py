@@ -23,6 +23,7 @@ from reconstruction.tangents.line_evidence import (
     LineEvidence,
     condition_lines,
     decide,
+    deviation_deg,
     half_sphere,
     line_scores,
     line_support,
@@ -40,7 +41,7 @@ from reconstruction.tangents.reflection import (
 CANDIDATES = 500  # directions that are scored at each point
 MOST_SATURATED = 0.1
 MOST_DEVIATION = 10.0
-"""Median of `Tangents.deviation` above which most directions are more than 10° off."""
+"""`Measured.deviation` above which most directions are more than 10° off."""
 TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
 MOST_POINTS = 250_000
 """At most so many points have directions: their scores and responses take about 6 GB under 331
@@ -65,6 +66,11 @@ class Measured:
     def none(cls) -> Measured:
         """No line at all."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+    @property
+    def deviation(self) -> float:
+        """Degrees: the median over the lines of `deviation_deg`; 0 without any."""
+        return float(np.median(deviation_deg(self.confidence))) if len(self.confidence) else 0.0
 
     def where(self, keep: Bools | slice) -> Measured:
         """The lines where `keep (N,)`."""
@@ -229,23 +235,23 @@ def measure_tangents(
                 f"directions from reflection are unreliable: the highlight is {table.contrast:.2f} "
                 "times its surroundings, under 1.3"
             )
-    deviation = float(np.median(tangents.deviation))
-    if deviation > MOST_DEVIATION:
+    measured = Measured(points, tangents.directions, tangents.confidence, apart)
+    if measured.deviation > MOST_DEVIATION:
         stage.warn(
-            f"directions are uncertain by {deviation:.0f}° in the median, over "
+            f"directions are uncertain by {measured.deviation:.0f}° in the median, over "
             f"{MOST_DEVIATION:g}°, and their errors are larger: strands follow the flow of the "
             "hair, not single hairs; pixels that are finer on the hair show more"
         )
     stage.figures.update(
         points=len(points),
         apart_mm=1e3 * apart,
-        deviation_deg=deviation,
+        deviation_deg=measured.deviation,
         cameras_per_point={
             str(k): int(n) for k, n in enumerate(np.bincount(visible.sum(axis=1))) if n
         },
         confidence={f"p{q}": float(np.percentile(tangents.confidence, q)) for q in (10, 50, 90)},
     )
-    return Measured(points, tangents.directions, tangents.confidence, apart)
+    return measured
 
 
 def _details(stack: OlatStack, mask: Bools, group: Ints, scale: float) -> Floats:

@@ -120,14 +120,14 @@ class Tangents:
     directions: Array
     confidence: Array
 
-    @property
-    def deviation(self) -> Array:
-        """Standard deviation `(N,)`, degrees, of directions with that confidence c.
 
-        Of a normal distribution about one direction: the two smaller eigenvalues are the variance
-        s², so that c = 1 − 3 s².
-        """
-        return np.degrees(np.sqrt((1 - self.confidence) / 3))
+def deviation_deg(confidence: AnyFloats) -> Array:
+    """Standard deviation, degrees, of directions with that `Tangents.confidence` c, of any shape.
+
+    Of a normal distribution about one direction: the two smaller eigenvalues are the variance s²,
+    so that c = 1 − 3 s².
+    """
+    return np.degrees(np.sqrt((1 - np.asarray(confidence, np.float64)) / 3))
 
 
 def decide(scores: AnyFloats, candidates: Array) -> Tangents:

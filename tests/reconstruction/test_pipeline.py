@@ -451,6 +451,7 @@ def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     segments = Segments(line, along, np.full(len(line), 0.2), 0 * ones, 3 * ones)
     monkeypatch.setattr("reconstruction.stages.line_strands", lambda *_, **__: ([line], segments))
     monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
+    monkeypatch.setattr("reconstruction.pipeline.MOST_DEVIATION", -1.0)  # texture is certain here
     reconstruct(unswept, Model(tmp_path), method="hull", options=replace(COARSE, max_length=0.7))
     strands = read_strands(tmp_path / "strands.npz")
     on = (np.abs(strands.points[:, 2]) < 1e-5) & (np.abs(strands.tangents()[:, 2]) < 1e-3)

@@ -15,6 +15,7 @@ from reconstruction.tangents.line_evidence import (
     LineEvidence,
     Tangents,
     decide,
+    deviation_deg,
     finer,
     half_sphere,
     line_scores,
@@ -117,8 +118,7 @@ def test_deviation_is_that_of_the_directions_that_a_confidence_describes(deg: fl
     drawn = np.column_stack([np.tan(turns), np.ones(len(turns))])
     drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
     values = np.linalg.eigvalsh(drawn.T @ drawn / len(drawn))
-    found = Tangents(np.array([[0.0, 0, 1]]), np.array([values[2] - values[1]])).deviation
-    assert found == pytest.approx(deg, rel=0.05)
+    assert deviation_deg(values[2] - values[1]) == pytest.approx(deg, rel=0.05)
 
 
 def test_no_texture_gives_no_confidence() -> None:
