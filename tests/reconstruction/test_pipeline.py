@@ -439,6 +439,16 @@ def test_written_strands_are_thinner_where_they_are_dense_unless_a_radius_is_giv
         assert np.median(dense) < 0.5 * np.median(sparse)
 
 
+def test_line_stereo_is_left_out_where_directions_are_certain(
+    unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reconstruction.stages.line_strands", None)
+    monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
+    report = reconstruct(unswept, Model(tmp_path), method="hull", options=COARSE)
+    assert report["orientation"].figures["deviation_deg"] < 10
+    assert "certain" in report["line stereo"].left_out[0].why
+
+
 @pytest.mark.slow
 def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     unswept: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
