@@ -6,7 +6,6 @@ on the hair alone come from a table of seconds per unit, scaled by the time of a
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ from reconstruction.light_planes.peaks import PER_PIXEL, Scan
 from reconstruction.methods import Method
 from reconstruction.pipeline import FINE_PIXEL, without
 from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
-from reconstruction.report.report import Progress, silent
+from reconstruction.report.report import Progress, silent, usable_cores
 from reconstruction.stages import method_for
 from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS, MOST_POINTS
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
@@ -351,7 +350,7 @@ class _Probe:
         step = min(self.options.light_codes.search.step, STEP_PIXELS * self.pixel)
         depths = 0.4 + 0.6 * 5e-4 / step
         words = -(-lights // WORD)  # of a lightcode
-        cores = len(os.sched_getaffinity(0))
+        cores = usable_cores()
         each = DEPTHS * (1 + 0.5 * words) * depths * 2 / cores
         add("depth", 0.0, each * hair * near, 2.5e-7 * hair)
         lines = 0.42 * hair * float(np.exp(-self.pixel / 1e-3))  # wide pixels agree less

@@ -167,7 +167,7 @@ class _Run:
 
         Single lights, photographs under constant light or patterns give directions. Line stereo
         adds lines if pixels are at most `FINE_PIXEL` wide and directions are uncertain: where they
-        are certain the cameras agree on the hull's surface, and lines beside it are mostly wrong.
+        are certain the cameras agree on the hull's surface, and lines beside it are often wrong.
         Without light nothing is measured; without a head no strand has a root.
         """
         o, capture, report = self.stages.options, masked.capture, self.stages.report

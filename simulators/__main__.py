@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import signal
 import sys
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from appearance.scene.backend import BackendError, ensure_backend
 from reconstruction.geometry.rig import RigError
+from reconstruction.report.report import usable_cores
 from simulators.frames.frames import FrameMaker, Sensor
 from simulators.frames.render_process import RenderPool
 from simulators.frames.responses import Quality, Responder, check_memory, reproducible
@@ -148,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--processes",
         type=int,
-        default=min(len(os.sched_getaffinity(0)), 4),
+        default=min(usable_cores(), 4),
         help="rendering processes; frames do not depend on their number (default: %(default)s)",
     )
     parser.add_argument(

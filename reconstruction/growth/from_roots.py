@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from reconstruction.arrays import AnyFloats, Array, Floats, Ints
 from reconstruction.growth.field import OrientationField
+from reconstruction.report.report import usable_cores
 
 _LIFT = 12e-3  # metres along the normal within which a root's envelope may begin
 _SHORTEST_FROM_ROOT, _SHORTEST_THROUGH_GAP = 5e-3, 10e-3
@@ -103,7 +103,7 @@ def grow_from_roots(
             out.append(path.copy() if near else np.vstack([root[None], path]))
         return out
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or usable_cores()) as pool:
         parts = pool.map(some, range(0, len(at), _TOGETHER))
         return [path for part in parts for path in part]
 

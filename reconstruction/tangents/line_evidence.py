@@ -125,7 +125,7 @@ def deviation_deg(confidence: AnyFloats) -> Array:
     """Standard deviation, degrees, of directions with that `Tangents.confidence` c, of any shape.
 
     Of a normal distribution about one direction: the two smaller eigenvalues are the variance s²,
-    so that c = 1 − 3 s².
+    so that c = 1 − 3 s². From 0 for c = 1 to 33 for c = 0, no direction at all.
     """
     return np.degrees(np.sqrt((1 - np.asarray(confidence, np.float64)) / 3))
 

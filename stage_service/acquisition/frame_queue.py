@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 from dataclasses import dataclass, replace
 
 from reconstruction import CaptureWriter, Rig, Step
 from reconstruction.capture.records import FrameRecord
+from reconstruction.report.report import usable_cores
 from stage_service.devices.cameras.interface import CameraInfo, Frame
 
-THREADS = len(os.sched_getaffinity(0)) + 2
+THREADS = usable_cores() + 2
 """Threads that convert, hash and write: one per processor, one that waits for the disk's writes and
 one for its flushes."""
 FEWEST_STEPS, MOST_STEPS = 2, 8

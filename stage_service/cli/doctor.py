@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+from reconstruction.report.report import usable_cores
 from stage_service.cli.stage.processes import DEFAULT_PORT
 from stage_service.cli.support.commands import FAILED, Commands, Output, add_command, whole
 
@@ -116,7 +117,7 @@ def _kernels() -> Iterator[Check]:
 
 
 def _cores() -> Check:
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     return Check("cores", "ok" if cores > 1 else "limited", f"{cores}")
 
 

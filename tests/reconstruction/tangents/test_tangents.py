@@ -119,6 +119,7 @@ def test_deviation_is_that_of_the_directions_that_a_confidence_describes(deg: fl
     drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
     values = np.linalg.eigvalsh(drawn.T @ drawn / len(drawn))
     assert deviation_deg(values[2] - values[1]) == pytest.approx(deg, rel=0.05)
+    assert deviation_deg([1, 0]) == pytest.approx([0, np.degrees(3**-0.5)])
 
 
 def test_no_texture_gives_no_confidence() -> None:
