@@ -129,13 +129,14 @@ class Desk:
 def stage(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[Callable[..., Desk]]:
     """`stage(*faults)`: the desk of a stage with these faults, one for all states."""
     slack, desks = machine_slack(), {}
-    rig = small_rig_text(slack).replace("lights = 24", f"lights = {LIGHTS}")
-    with simulating(tmp_path_factory.mktemp("desk"), rig, slack) as start:
+    rig = small_rig_text(slack, 3.0).replace("lights = 24", f"lights = {LIGHTS}")
+    with simulating(tmp_path_factory.mktemp("desk"), small_rig_text(slack), slack) as start:
 
         def of(*faults: Fault) -> Desk:
             if faults not in desks:
                 folder = tmp_path_factory.mktemp("service")
-                desks[faults] = Desk(folder, browser, *start(*faults))
+                desks[faults] = Desk(folder, browser, *start(*faults, rig=rig))
+                assert len(desks[faults].http.get("/rig").json()["lights"]) == LIGHTS
             return desks[faults]
 
         yield of
