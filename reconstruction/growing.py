@@ -27,6 +27,7 @@ from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
 
 SPACING = 2e-3  # metres between a written strand's points
+SURE = 4.0  # voxels from a measured line within which the depth of hair is taken as measured
 
 
 @dataclass(frozen=True)
@@ -135,10 +136,11 @@ class GrowingStages(Stages):
         cloud: PointCloud,
         cameras: Sequence[Camera],
         depths: Mapping[str, Array],
+        grid: float,
     ) -> Strands:
         """Strands refined jointly by the `measured` lines, if there is a sweep.
 
-        `depths (H, W)` are those of each camera's hair pixels.
+        `depths (H, W)` are those of each camera's hair pixels, `grid` is the envelope's, metres.
         """
         o = self.options.refine
         with self.report.stage("refinement") as stage:
@@ -155,7 +157,7 @@ class GrowingStages(Stages):
                 return strands
             self.progress("refining strands", 0.0)
             surfaces = [(camera, depths[camera.name]) for camera in cameras]
-            strands, figures = refine(strands, lines, o, surfaces, lines.apart)
+            strands, figures = refine(strands, lines, o, surfaces, lines.apart, SURE * grid)
             stage.figures.update(figures)
         return strands
 

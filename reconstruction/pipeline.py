@@ -144,7 +144,9 @@ class _Run:
             scalp = find_scalp(head.mesh, envelope)
             field = growing.field(envelope, measured, scalp)
             grown = growing.grown(field, scalp, polylines, options.within)
-            strands = growing.refined(grown.strands, measured, cloud, masked.cameras, depths)
+            strands = growing.refined(
+                grown.strands, measured, cloud, masked.cameras, depths, scale.grid
+            )
             growing.rooted(strands, lines, scalp if grown.rooted else None, head.scalp_map)
 
     def line_stereo(
@@ -209,7 +211,9 @@ class _Run:
         within = SHELL if o.within is None else o.within  # lines lie on the hull, millimetres off
         if head is not None and scalp is not None:
             grown = self.growing.grown(field, scalp, polylines, within)
-            strands = self.growing.refined(grown.strands, measured, cloud, masked.cameras, depths)
+            strands = self.growing.refined(
+                grown.strands, measured, cloud, masked.cameras, depths, scale.grid
+            )
             self.growing.rooted(strands, written, scalp if grown.rooted else None, head.scalp_map)
             return
         with report.stage("strands") as stage:

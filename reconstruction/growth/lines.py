@@ -61,3 +61,21 @@ class Lines:
 
 Surfaces = Sequence[tuple[Camera, Array]]
 """Cameras, each with the depth `(H, W)` of its hair's pixels, 0 elsewhere."""
+
+
+def near_measured(surfaces: Surfaces, points: AnyFloats, reach: float) -> Surfaces:
+    """The `surfaces` within `reach` metres of measured `points (N, 3)`, n > 0; 0 elsewhere.
+
+    Elsewhere no line was measured that could support hair, and a depth is only the envelope's.
+    """
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    out = []
+    for camera, depth in surfaces:
+        y, x = np.nonzero(depth)
+        rays = camera.rays(np.stack([x, y], axis=1))
+        there = camera.center + rays * (depth[y, x] / (rays @ camera.R[2]))[:, None]
+        near, _ = tree.query(there, distance_upper_bound=reach, workers=-1)
+        known = np.zeros_like(depth)
+        known[y, x] = np.where(np.isfinite(near), depth[y, x], 0)
+        out.append((camera, known))
+    return out

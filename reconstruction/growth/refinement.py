@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
 from reconstruction.geometry.strands import Strands, unit_or_zero
-from reconstruction.growth.lines import BLOCK, GUESSED, REACH, Lines, Surfaces
+from reconstruction.growth.lines import BLOCK, GUESSED, REACH, Lines, Surfaces, near_measured
 from reconstruction.growth.selection import select_by_coverage, without_exposed_ends
 from reconstruction.reconstruct_options import RefineOptions
 from reconstruction.tangents.estimate import Measured
@@ -81,16 +81,19 @@ def refine(
     options: RefineOptions,
     surfaces: Surfaces = (),
     apart: float = np.inf,
+    near: float = np.inf,
 ) -> tuple[Strands, dict[str, Any]]:
     """Drop the strands that add no coverage and move the others onto the measured lines.
 
-    Guessed points move behind the `surfaces`; lines are `apart` metres from one another. Also
-    returns JSON-ready figures. At least one line must be measured. Raises `ValueError` where no
-    strand adds `options.marginal_coverage`.
+    Guessed points move behind the `surfaces`; lines are `apart` metres from one another. Surfaces
+    farther than `near` metres from all lines contradict no strand. Also returns JSON-ready figures.
+    At least one line must be measured. Raises `ValueError` where no strand adds
+    `options.marginal_coverage`.
     """
     lines = Lines(measured, apart)
-    strands = without_exposed_ends(strands, lines, surfaces)
-    kept = select_by_coverage(strands, lines, options.marginal_coverage, surfaces)
+    known = near_measured(surfaces, measured.points, near)
+    strands = without_exposed_ends(strands, lines, known)
+    kept = select_by_coverage(strands, lines, options.marginal_coverage, known)
     if not kept.any():
         raise ValueError(
             f"no strand adds refine.marginal_coverage {options.marginal_coverage:g} per "

@@ -240,7 +240,7 @@ def measure_tangents(
         stage.warn(
             f"directions are uncertain by {measured.deviation:.0f}° in the median, over "
             f"{MOST_DEVIATION:g}°, and their errors are larger: strands follow the flow of the "
-            "hair, not single hairs; pixels that are finer on the hair show more"
+            "hair, not fibres; pixels that are finer on the hair show more"
         )
     stage.figures.update(
         points=len(points),

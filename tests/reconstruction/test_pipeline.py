@@ -446,6 +446,7 @@ def test_line_stereo_is_left_out_where_directions_are_certain(
     monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
     report = reconstruct(unswept, Model(tmp_path), method="hull", options=COARSE)
     assert report["orientation"].figures["deviation_deg"] < 10
+    assert not any("uncertain" in text for text in report["orientation"].warnings)
     assert "certain" in report["line stereo"].left_out[0].why
 
 
@@ -461,8 +462,11 @@ def test_confidence_is_that_of_the_segments_not_what_they_count_in_the_field(
     segments = Segments(line, along, np.full(len(line), 0.2), 0 * ones, 3 * ones)
     monkeypatch.setattr("reconstruction.stages.line_strands", lambda *_, **__: ([line], segments))
     monkeypatch.setattr("reconstruction.pipeline.FINE_PIXEL", 1.0)
-    monkeypatch.setattr("reconstruction.pipeline.MOST_DEVIATION", -1.0)  # texture is certain here
-    reconstruct(unswept, Model(tmp_path), method="hull", options=replace(COARSE, max_length=0.7))
+    for module in ("pipeline", "tangents.estimate"):  # texture is certain here
+        monkeypatch.setattr(f"reconstruction.{module}.MOST_DEVIATION", -1.0)
+    options = replace(COARSE, max_length=0.7)
+    report = reconstruct(unswept, Model(tmp_path), method="hull", options=options)
+    assert any("uncertain by" in text for text in report["orientation"].warnings)
     strands = read_strands(tmp_path / "strands.npz")
     on = (np.abs(strands.points[:, 2]) < 1e-5) & (np.abs(strands.tangents()[:, 2]) < 1e-3)
     assert on.sum() > 100
