@@ -96,15 +96,17 @@ def refine(
     kept = select_by_coverage(strands, lines, options.marginal_coverage, known)
     if not kept.any():
         raise ValueError(
-            f"no strand adds refine.marginal_coverage {options.marginal_coverage:g} per "
-            "millimetre: give less; 0 keeps every strand"
+            f"no strand adds refine.marginal_coverage {options.marginal_coverage:g} per cell: "
+            "give less; 0 keeps every strand"
         )
     start = out = strands.subset(kept)
     guesses = Guesses.of(start, lines, surfaces)
     for _ in range(options.steps):
         out = gauss_newton_step(out, start, lines, guesses)
     moved = np.linalg.norm(out.points - start.points, axis=1)
+    hair = sum(int((depth > 0).sum()) for _, depth in surfaces)
     figures = {
+        "surface_near_lines": sum(int((depth > 0).sum()) for _, depth in known) / max(hair, 1),
         "removed": int((~kept).sum()),
         "strands": len(out),
         "metres_before": float(strands.lengths().sum()),

@@ -211,16 +211,23 @@ def test_an_exposed_end_that_no_line_supports_is_cut_off(behind: float, kept: in
     np.testing.assert_array_equal(out.roots, given.roots)
 
 
-@pytest.mark.parametrize(("near", "kept"), [(np.inf, 1), (30e-3, 1), (10e-3, 2)])
-def test_a_surface_far_from_all_lines_contradicts_no_strand(near: float, kept: int) -> None:
-    """Two strands on a wall 0.5 m before a camera; lines on one of them, 20 mm from the other."""
+@pytest.mark.parametrize(
+    ("near", "kept", "share"), [(np.inf, 1, 1.0), (30e-3, 1, 0.575), (10e-3, 2, 0.149)]
+)
+def test_a_surface_far_from_all_lines_contradicts_no_strand(
+    near: float, kept: int, share: float
+) -> None:
+    """Two strands on a wall 0.5 m before a camera; lines on one of them, 20 mm from the other.
+
+    The share is the area of a rectangle with two half discs, within the 10 cm that the camera sees.
+    """
     axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     K = np.array([[500.0, 0, 49.5], [0, 500, 49.5], [0, 0, 1]])
     camera = Camera(name="c", K=K, R=axes, t=-axes @ [0, -0.5, 0], width=100, height=100)
     z = np.arange(-0.03, 0.03, 1e-3)
     swept = np.stack([np.full_like(z, -0.01), np.zeros_like(z), z], axis=1)
     up = np.tile([0.0, 0.0, 1.0], (len(z), 1))
-    made, _ = refine(
+    made, figures = refine(
         Strands.from_list([swept, swept + np.array([0.02, 0, 0])]),
         Measured(swept, up, np.ones(len(z))),
         RefineOptions(),
@@ -228,6 +235,7 @@ def test_a_surface_far_from_all_lines_contradicts_no_strand(near: float, kept: i
         near=near,
     )
     assert len(made) == kept
+    assert figures["surface_near_lines"] == pytest.approx(share, abs=0.01)
 
 
 def test_lines_that_are_denser_support_and_cover_less_far() -> None:
