@@ -121,7 +121,7 @@ class GrowingStages(Stages):
                 options=asdict(o),
             )
             if result.dropped or not reached:
-                away = result.dropped if reached else result.dropped + result.joined
+                away = result.dropped if reached else result.dropped + result.joined + result.led
                 consequence = "and were removed" if reached else "so that no strand is rooted"
                 stage.warn(
                     f"{away} of {len(rooted) + len(loose)} strands could not be connected to the "

@@ -43,8 +43,8 @@ class MeasureOptions:
     pixels, or as far as 250,000 points are apart). Points up to `tolerance` behind a camera's depth
     are visible in it (None: 5/3 pixels). Scores of a point's directions are averaged over up to
     `neighbours` within `radius`; those of reflections under single lights count `reflection_weight`
-    times those of the texture. None: the radius and weight by which half of the cameras predicts
-    the other half best.
+    times those of the texture, those of the lines in which a sweep's points lie `line_weight`
+    times. None: the radius and weights by which half of the cameras predicts the other half best.
     """
 
     bank: LogGaborBank = LogGaborBank(wavelength=4.0, count=24, spread=1.5)
@@ -53,6 +53,7 @@ class MeasureOptions:
     neighbours: Count = 96
     thin: Length | None = None
     reflection_weight: Factor | None = None
+    line_weight: Factor | None = None
     tolerance: Length | None = None
 
 

@@ -209,7 +209,7 @@ class MeasuringStages(Stages):
         """The measured tangents."""
         with self.report.stage("orientation") as stage:
             return measure_tangents(
-                masked, cloud.points, depths, scale, self.options.measure, stage, self.progress
+                masked, cloud, depths, scale, self.options.measure, stage, self.progress
             )
 
     def surface(self, measured: Measured, cloud: PointCloud) -> list[AnyFloats]:

@@ -29,25 +29,28 @@ _LEAST_COSINE = np.cos(np.radians(45.0))
 
 
 _LED = 20
-"""Strands that may join one that reaches the scalp, on average. Their connections are copies of its
-path: beyond that number most of a patch's strands are copies, and its few roots are chance."""
+"""Guessed connections for one strand that reaches the scalp, on average: joined strands have copies
+of its path, those that are led from afar nobody's. Beyond that number a patch's few roots are
+chance."""
 
 
 @dataclass(frozen=True)
 class Rooted:
-    """Rooted strands, and how many loose ones were connected `to_scalp`, `joined` a rooted
-    neighbour or were `dropped`."""
+    """Rooted strands, and how many loose ones were connected `to_scalp`, of them from more than
+    8 mm above it `led`, `joined` a rooted neighbour or were `dropped`."""
 
     strands: list[Floats]
     to_scalp: int
+    led: int
     joined: int
     dropped: int
 
     @property
     def reaches(self) -> bool:
-        """Whether the strands reach the scalp: most of them, and enough without a neighbour."""
-        itself = len(self.strands) - self.joined
-        return self.dropped <= len(self.strands) and self.joined <= _LED * itself
+        """Whether the strands reach the scalp: most of them, and enough without a guess."""
+        guessed = self.joined + self.led
+        itself = len(self.strands) - guessed
+        return self.dropped <= len(self.strands) and guessed <= _LED * itself
 
 
 def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
@@ -61,7 +64,7 @@ def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
     """
     strands = list(rooted)
     if not loose:
-        return Rooted(strands, 0, 0, 0)
+        return Rooted(strands, 0, 0, 0, 0)
     below = _Below(scalp)
     pending: list[_Loose] = []
     for path, h in zip(loose, below.heights(_ends(loose)), strict=True):
@@ -78,7 +81,7 @@ def root_all(rooted: list[Floats], loose: list[Floats], scalp: Scalp) -> Rooted:
         joined += len(attached)
         strands += attached
     led = [below.lead_lower(path, h) for path, h in pending if h.min() <= _HIGHEST]
-    return Rooted(strands + led, to_scalp + len(led), joined, len(pending) - len(led))
+    return Rooted(strands + led, to_scalp + len(led), len(led), joined, len(pending) - len(led))
 
 
 class _Below:

@@ -16,6 +16,7 @@ from reconstruction.geometry.lights import Light
 from reconstruction.images.grey import grey
 from reconstruction.images.orientation import responses, textures
 from reconstruction.images.silhouettes import NO_SINGLE_LIGHTS, lit_frame
+from reconstruction.light_planes.point_cloud import PointCloud
 from reconstruction.masks import MaskedCapture
 from reconstruction.reconstruct_options import MeasureOptions
 from reconstruction.report.report import Progress, Stage, silent
@@ -29,7 +30,8 @@ from reconstruction.tangents.line_evidence import (
     line_support,
     visible_from,
 )
-from reconstruction.tangents.pooling import chosen, pool
+from reconstruction.tangents.point_lines import halves_of_lines
+from reconstruction.tangents.pooling import Evidence, chosen, pool
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
     OlatStack,
@@ -44,7 +46,7 @@ MOST_DEVIATION = 10.0
 """`Measured.deviation` above which most directions are more than 10° off."""
 TRANSPARENT = 3.0  # tolerances between a point and the surface behind it
 MOST_POINTS = 250_000
-"""At most so many points have directions: their scores and responses take about 6 GB under 331
+"""At most so many points have directions: their scores and responses take about 7 GB under 331
 lights in 16 cameras, beside a sweep's points."""
 ROUNDS = 2  # of the reflection table, filled from the directions of the round before
 LIGHT_GROUPS = 24  # groups of neighbouring lights, each with a texture of its own
@@ -143,14 +145,14 @@ class Saturation:
 
 def measure_tangents(
     masked: MaskedCapture,
-    points: Array,
+    cloud: PointCloud,
     depths: Mapping[str, Array],
     scale: CaptureScale,
     options: MeasureOptions = MeasureOptions(),
     stage: Stage | None = None,
     progress: Progress = silent,
 ) -> Measured:
-    """Directions at the triangulated `points (N, 3)`, or without any, at the depths'.
+    """Directions at the triangulated points of the `cloud`, or without any, at the depths'.
 
     `depths[camera] (H, W)` of the hair pixels are metres along z. Raises `CaptureError` for a
     capture without OLAT, fully lit and pattern frames.
@@ -166,6 +168,7 @@ def measure_tangents(
     group = light_groups(lights, LIGHT_GROUPS)
     cameras = [c for c in masked.cameras if masked.masks[c.name].hair.any()]
     shown = [np.where(masked.masks[c.name].hair, depths[c.name], 0.0) for c in cameras]
+    points = cloud.points
     if not len(points):
         lifted = [_lifted(*view) for view in zip(cameras, shown, strict=True)]
         points = np.concatenate(lifted) if lifted else points
@@ -200,11 +203,13 @@ def measure_tangents(
         del stack, support  # before the next camera's are read
     saturation.record(stage)
     stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
-    given = (options.radius, options.reflection_weight)
-    found = chosen(points, apart, halves, None, *given)
+    second = [camera.name for camera in cameras[1::2]]
+    lines = halves_of_lines(points, cloud, second, scale.pixel, candidates)
+    given = (options.radius, options.reflection_weight, options.line_weight)
+    found = chosen(points, apart, Evidence(halves, lines=lines), *given)
     stage.figures["texture_radius_mm"] = 1e3 * found.radius
-    scores = halves.sum(axis=0)
-    tangents = decide(pool(points, found.radius, options.neighbours) @ scores, candidates)
+    near = pool(points, found.radius, options.neighbours)
+    tangents = decide(near @ found.total(Evidence(halves, lines=lines)), candidates)
     if not reads:
         stage.leave_out(
             "directions from reflection",
@@ -219,13 +224,11 @@ def measure_tangents(
             more = np.zeros_like(halves)
             for k, o in enumerate(observations):
                 more[k % 2, o.index] += table.scores(o, points, candidates)
-            found = chosen(points, apart, halves, more, *given)
+            evidence = Evidence(halves, more, lines)
+            found = chosen(points, apart, evidence, *given)
             near = pool(points, found.radius, options.neighbours)
-            total = more.sum(axis=0)
-            total *= np.float32(found.weight)
-            total += scores
-            tangents = decide(near @ total, candidates)
-            del more, total
+            tangents = decide(near @ found.total(evidence), candidates)
+            del more, evidence
         stage.figures.update(radius_mm=1e3 * found.radius, reflection_weight=found.weight)
         turned = np.abs((tangents.directions * texture_only.directions).sum(axis=1)).clip(0, 1)
         stage.figures["lobe_contrast"] = table.contrast
@@ -245,6 +248,7 @@ def measure_tangents(
     stage.figures.update(
         points=len(points),
         apart_mm=1e3 * apart,
+        line_weight=found.lines,
         deviation_deg=measured.deviation,
         cameras_per_point={
             str(k): int(n) for k, n in enumerate(np.bincount(visible.sum(axis=1))) if n

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -16,6 +16,13 @@ RADII = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 WEIGHTS = (0.0, 0.15, 0.3, 0.5, 0.8, 1.5, 3.0, 6.0)
 """Weights of reflection beside texture that are compared."""
+
+LINE_WEIGHTS = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+"""Weights of the lines of points beside texture that are compared."""
+
+LINES_GAIN = 1.05
+"""Least gain in agreement by lines of points. Beside a gap in the points they are often wrong,
+which costs straight hair more than it gains."""
 
 MOST_RADIUS = 10e-3
 """Metres: hair turns within a centimetre."""
@@ -50,72 +57,118 @@ def pool(
     return table
 
 
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Scores `(2, N, D)` of the same directions by two disjoint sets of cameras: by `texture`,
+    `reflection` and the `lines` in which triangulated points lie."""
+
+    texture: Floats
+    reflection: Floats | None = None
+    lines: Floats | None = None
+
+
 @dataclass(frozen=True)
 class Pooling:
-    """The `radius` of averages, metres, and the `weight` of reflection beside texture.
+    """The `radius` of averages, metres, and weights beside texture.
 
-    `agreement` of two halves of the cameras, see `chosen`.
+    `weight` of reflection, `lines` of the lines of points. `agreement` of two halves of the
+    cameras, see `chosen`.
     """
 
     radius: float
     weight: float
+    lines: float
     agreement: float
+
+    def total(self, evidence: Evidence) -> Floats:
+        """The weighted scores of both halves `(N, D)`."""
+        out = evidence.texture.sum(axis=0)
+        for kind, weight in ((evidence.reflection, self.weight), (evidence.lines, self.lines)):
+            for half in () if kind is None or weight == 0 else kind:
+                out += np.float32(weight) * half
+        return out
 
 
 def chosen(
     points: Array,
     spacing: float,
-    texture: Floats,
-    reflection: Floats | None,
+    evidence: Evidence,
     radius: float | None = None,
     weight: float | None = None,
+    lines: float | None = None,
 ) -> Pooling:
-    """The radius and weight by which half of the cameras predicts the other half best.
+    """The radius and weights by which half of the cameras predicts the other half best.
 
-    `texture` and `reflection (2, N, D)` are scores of the same directions by two disjoint sets of
-    cameras; `spacing` of `points (N, 3)` in metres. The direction that one half, pooled and
-    weighted, scores highest is looked up in the other half at the point itself: too small a radius
-    leaves noise, too large a one blurs hair that turns. The agreement is the mean score there in
-    standard deviations, summed over both kinds; 0 by chance. A given `radius` or `weight` stays.
+    `spacing` of `points (N, 3)` in metres. The direction that one half, pooled and weighted, scores
+    highest is looked up in the other half at the point itself: too small a radius leaves noise, too
+    large a one blurs hair that turns. The agreement is the mean score there in standard deviations;
+    0 by chance. Its sum over texture and lines decides; where lines add less than `LINES_GAIN`,
+    their weight is 0 and the sum over texture and reflection decides, whose halves share lights and
+    shadows. A given `radius` or weight stays.
 
     Without a point that both halves score, the agreement is 0 and `UNKNOWN_RADIUS` and
     `UNKNOWN_WEIGHT` are taken. Raises `ValueError` for scores that are not finite.
     """
+    texture = evidence.texture
     if not texture.any(axis=2).all(axis=0).any():
         return Pooling(
             radius or min(UNKNOWN_RADIUS * spacing, MOST_RADIUS),
             UNKNOWN_WEIGHT if weight is None else weight,
+            0.0 if lines is None else lines,
             0.0,
         )
     rows = np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64))
     radii = [r * spacing for r in RADII if r * spacing <= MOST_RADIUS] or [MOST_RADIUS]
-    weights = WEIGHTS if weight is None else (weight,)
-    kinds = [texture] if reflection is None else [texture, reflection]
-    own = [kind[:, rows] for kind in kinds]
-    best = Pooling(0.0, 0.0, -np.inf)
+    kinds = texture, evidence.reflection, evidence.lines
+    own = [None if kind is None else [_standard(half[rows]) for half in kind] for kind in kinds]
+    plain = with_lines = Pooling(0.0, 0.0, 0.0, -np.inf)
+    without_lines = -np.inf  # the agreement of texture and lines
     for r in radii if radius is None else [radius]:
         near = pool(points, r, NEIGHBOURS, rows)
-        pooled = [[near @ half for half in kind] for kind in kinds]
-        for w in weights if reflection is not None else (0.0,):
-            both = pooled[0]
-            if reflection is not None:
-                both = [a + np.float32(w) * b for a, b in zip(*pooled, strict=True)]
-            total = sum([agreement(both, list(kind)) for kind in own])
-            if total > best.agreement:
-                best = Pooling(float(r), float(w), total)
-    return best
+        alone = [near @ half for half in texture]
+        for first, w in _weighted(near, evidence.reflection, weight, WEIGHTS, alone):
+            for both, c in _weighted(near, evidence.lines, lines, LINE_WEIGHTS, first):
+                best = [scores.argmax(axis=1) for scores in both]
+                each = [0.0 if kind is None else _agreement(best, kind) for kind in own]
+                found = Pooling(float(r), float(w), float(c), each[0] + each[2])
+                if found.agreement > with_lines.agreement:
+                    with_lines = found
+                if c == 0:
+                    without_lines = max(without_lines, found.agreement)
+                    if each[0] + each[1] > plain.agreement:
+                        plain = replace(found, agreement=each[0] + each[1])
+    gain = with_lines.lines > 0 and with_lines.agreement > LINES_GAIN * without_lines
+    return with_lines if gain else plain
 
 
-def agreement(pooled: Sequence[Floats], own: Sequence[Floats]) -> float:
-    """How high the best direction of two `pooled (M, D)` scores in each other's `own (M, D)`.
+def _weighted(
+    near: sparse.csr_array,
+    kind: Floats | None,
+    given: float | None,
+    weights: Sequence[float],
+    base: list[Floats],
+) -> Iterator[tuple[list[Floats], float]]:
+    """`base`, two of `(M, D)`, with the halves of a `kind` pooled and added by each weight."""
+    if kind is None:
+        yield base, 0.0
+        return
+    pooled = [near @ half for half in kind]
+    for w in weights if given is None else (given,):
+        yield [a + np.float32(w) * b for a, b in zip(base, pooled, strict=True)], w
 
-    The mean over that of all directions, in standard deviations; the sum of both ways.
+
+def _standard(scores: Floats) -> Floats:
+    """`scores (M, D)` over their mean over the directions, in standard deviations."""
+    spread = float(scores.std())
+    if not np.isfinite(spread):
+        raise ValueError("scores must be finite: check the frames for pixels without a number")
+    return (scores - scores.mean(axis=1, keepdims=True)) / np.float32(spread if spread > 0 else 1.0)
+
+
+def _agreement(best: Sequence[Ints], standard: Sequence[Floats]) -> float:
+    """How high the `best (M,)` directions of two halves score in each other's `standard (M, D)`.
+
+    The sum of both ways.
     """
-    total = 0.0
-    for scores, others in zip(pooled, reversed(own), strict=True):
-        spread = float(others.std())
-        if not np.isfinite(spread):
-            raise ValueError("scores must be finite: check the frames for pixels without a number")
-        there = others[np.arange(len(others)), scores.argmax(axis=1)] - others.mean(axis=1)
-        total += float(there.mean()) / spread if spread > 0 else 0.0
-    return total
+    ways = zip(best, reversed(standard), strict=True)
+    return sum(float(scores[np.arange(len(scores)), found].mean()) for found, scores in ways)

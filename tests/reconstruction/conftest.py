@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruction import Camera, Capture, Light, Projector, Rig, write_exr
+from reconstruction.light_planes import PointCloud
 
 RADIUS = 0.1
 SIZE, ROWS = 64, 40
@@ -184,6 +185,20 @@ def shoot(
 def stage_camera() -> Callable[..., Camera]:
     """Makes a camera of the sphere's stage: name, azimuth and elevation in degrees."""
     return camera
+
+
+@pytest.fixture(scope="session")
+def cloud_of() -> Callable[..., PointCloud]:
+    """Makes a cloud of points `(N, 3)`, the number of each one's camera `(N,)`, and their names."""
+
+    def make(points: NDArray[np.float64], of: NDArray[np.int64], names: list[str]) -> PointCloud:
+        n, zero, one = len(points), np.zeros(len(points)), np.ones(len(points), np.float32)
+        covariance, view = np.tile(1e-8 * np.eye(3), (n, 1, 1)), np.tile([0, 0, 1.0], (n, 1))
+        rest = zero.astype(np.int16), 0 * one, zero.astype(np.int32), one, one
+        pixel, camera = np.zeros((n, 2), np.int32), of.astype(np.int16)
+        return PointCloud(points, covariance, view, pixel, camera, *rest, tuple(names), ("p",))
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ from reconstruction.methods import Method
 
 METHODS: tuple[Method, ...] = ("light_planes", "hull")
 AT = ("1mm_10deg", "2mm_20deg", "3mm_30deg")
-TANGENTS = ("texture_radius_mm", "radius_mm", "reflection_weight")
+TANGENTS = ("texture_radius_mm", "radius_mm", "reflection_weight", "line_weight")
 SAMPLES = 20_000
 HEADER = (
     "| subject | pixel mm | | F at 1 / 2 / 3 mm | precision | recall | F at equal length "

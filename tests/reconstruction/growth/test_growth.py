@@ -216,3 +216,15 @@ def test_copies_of_one_way_to_the_scalp_do_not_root_a_patch(loose: int, reaches:
     x = np.linspace(-2e-3, 2e-3, loose)
     result = root_all(rooted, [line((a, 0, 0.05), (a, 0, 0.1)) for a in x], flat_scalp())
     assert (result.joined, result.dropped, result.reaches) == (loose, 0, reaches)
+
+
+@pytest.mark.parametrize(("near", "reaches"), [(0, False), (1, True)])
+def test_connections_from_afar_alone_do_not_root_a_patch(near: int, reaches: bool) -> None:
+    """Of a patch of curls no strand grew from the scalp, and 22,868 were led to it through hair
+    that nothing showed: four fifths of all metres."""
+    x = np.linspace(-0.02, 0.02, 20)
+    beside = [line((0, 0.02, 5e-3), (0, 0.02, 0.05))] * near
+    result = root_all(
+        [], [line((a, -0.02, 0.03), (a, -0.02, 0.1)) for a in x] + beside, flat_scalp()
+    )
+    assert (result.led, result.to_scalp, result.reaches) == (20, 20 + near, reaches)

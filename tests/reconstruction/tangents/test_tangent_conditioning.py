@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,8 +12,10 @@ import pytest
 from reconstruction import Camera, Capture, Light
 from reconstruction.capture_scale import CaptureScale
 from reconstruction.geometry.lights import dome_positions
+from reconstruction.light_planes import PointCloud
 from reconstruction.masks import HairMask, MaskedCapture
-from reconstruction.tangents.estimate import measure_tangents
+from reconstruction.reconstruct_options import MeasureOptions
+from reconstruction.tangents.estimate import Measured, measure_tangents
 from reconstruction.tangents.line_evidence import LineEvidence, condition_lines
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -85,13 +87,10 @@ def test_no_points_are_no_trouble() -> None:
     json.dumps(found.figures(), allow_nan=False)
 
 
-@pytest.mark.parametrize("count", [1, 8, 30], ids=["one light", "each light", "groups"])
-def test_orientations_come_from_each_light_or_from_groups(
-    shoot: Callable[..., Capture], stage_camera: Callable[..., Camera], count: int
-) -> None:
-    lights = [Light(f"l{i}", p, np.ones(3)) for i, p in enumerate(dome_positions(count, 1.2, 0.0))]
+def meridians(lights: list[Light]) -> Callable[..., np.ndarray]:
+    """Draws a sphere of 10 cm with stripes along its meridians."""
 
-    def meridians(step: dict[str, object], camera: Camera) -> np.ndarray:
+    def draw(step: dict[str, object], camera: Camera) -> np.ndarray:
         grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
         rays = camera.rays(grid)
         b = rays @ camera.center
@@ -102,18 +101,76 @@ def test_orientations_come_from_each_light_or_from_groups(
         bright = (1.2 + np.cos(40 * azimuth)) * (0.05 + np.maximum(shade, 0))
         return np.where(inside > 0, bright, 0.0)
 
-    cameras = [stage_camera(f"c{a}", a, 0.0, size=80) for a in (-40, 0, 40)]
-    capture = shoot(cameras=cameras, projectors=[], lights=lights, extra=meridians, samples=1)
-    z, a = (v.ravel() for v in np.meshgrid(np.linspace(-0.05, 0.05, 9), np.linspace(-0.6, 0.6, 9)))
+    return draw
+
+
+def on_sphere(z: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Points of that sphere at the heights and azimuths of a grid."""
+    z, a = (v.ravel() for v in np.meshgrid(z, a))
     r = np.sqrt(0.01 - z**2)
-    points = np.stack([r * np.sin(a), -r * np.cos(a), z], axis=1)
-    whole = np.ones((80, 80), bool)
-    masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
-    depths = {c.name: np.full((80, 80), 0.85) for c in cameras}
-    scale = replace(CaptureScale.of(cameras, points), tolerance=0.1)
-    found = measure_tangents(MaskedCapture(capture, masks), points, depths, scale)
+    return np.stack([r * np.sin(a), -r * np.cos(a), z], axis=1)
+
+
+def off_meridians(found: Measured) -> float:
+    """Median degrees between measured directions and the meridians."""
     n = found.points / np.linalg.norm(found.points, axis=1, keepdims=True)
     t = UP - n[:, 2:] * n
     t /= np.linalg.norm(t, axis=1, keepdims=True)
-    off = np.degrees(np.arccos(np.abs((found.directions * t).sum(axis=1)).clip(0, 1)))
-    assert np.median(off) < 8
+    cosine = np.abs((found.directions * t).sum(axis=1)).clip(0, 1)
+    return float(np.median(np.degrees(np.arccos(cosine))))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Cameras at some azimuths before the sphere, and its frames."""
+
+    cameras: list[Camera]
+    masked: MaskedCapture
+
+    @classmethod
+    def of(
+        cls,
+        shoot: Callable[..., Capture],
+        stage_camera: Callable[..., Camera],
+        count: int,
+        azimuths: tuple[int, ...],
+    ) -> Stage:
+        places = enumerate(dome_positions(count, 1.2, 0.0))
+        lights = [Light(f"l{i}", p, np.ones(3)) for i, p in places]
+        cameras = [stage_camera(f"c{a}", a, 0.0, size=80) for a in azimuths]
+        draw = meridians(lights)
+        capture = shoot(cameras=cameras, projectors=[], lights=lights, extra=draw, samples=1)
+        whole = np.ones((80, 80), bool)
+        masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
+        return cls(cameras, MaskedCapture(capture, masks))
+
+    def measured(self, cloud: PointCloud, options: MeasureOptions) -> Measured:
+        depths = {c.name: np.full((80, 80), 0.85) for c in self.cameras}
+        scale = replace(CaptureScale.of(self.cameras, cloud.points), tolerance=0.1)
+        return measure_tangents(self.masked, cloud, depths, scale, options)
+
+
+@pytest.mark.parametrize("count", [1, 8, 30], ids=["one light", "each light", "groups"])
+def test_orientations_come_from_each_light_or_from_groups(
+    shoot: Callable[..., Capture],
+    stage_camera: Callable[..., Camera],
+    cloud_of: Callable[..., PointCloud],
+    count: int,
+) -> None:
+    stage = Stage.of(shoot, stage_camera, count, (-40, 0, 40))
+    points = on_sphere(np.linspace(-0.05, 0.05, 9), np.linspace(-0.6, 0.6, 9))
+    cloud = cloud_of(points, np.zeros(len(points)), [c.name for c in stage.cameras])
+    assert off_meridians(stage.measured(cloud, MeasureOptions())) < 8
+
+
+def test_points_of_a_sweep_give_the_slope_that_cameras_side_by_side_do_not(
+    shoot: Callable[..., Capture],
+    stage_camera: Callable[..., Camera],
+    cloud_of: Callable[..., PointCloud],
+) -> None:
+    stage = Stage.of(shoot, stage_camera, 1, (-2, 2))
+    points = on_sphere(np.arange(0.045, 0.08, 1e-3), np.arange(-0.4, 0.4, 0.015))
+    cloud = cloud_of(points, np.arange(len(points)) % 2, [c.name for c in stage.cameras])
+    texture = off_meridians(stage.measured(cloud, MeasureOptions(line_weight=0.0)))
+    assert texture > 30  # across the views, whatever the slope
+    assert off_meridians(stage.measured(cloud, MeasureOptions())) < 15  # candidates are 7 apart
