@@ -225,7 +225,7 @@ def measure_tangents(
             for k, o in enumerate(observations):
                 more[k % 2, o.index] += table.scores(o, points, candidates)
             evidence = Evidence(halves, more, lines)
-            found = chosen(points, apart, evidence, *given)
+            found = chosen(points, apart, evidence, *given, contrast=table.contrast)
             near = pool(points, found.radius, options.neighbours)
             tangents = decide(near @ found.total(evidence), candidates)
             del more, evidence

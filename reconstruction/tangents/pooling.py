@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -17,12 +17,15 @@ RADII = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 WEIGHTS = (0.0, 0.15, 0.3, 0.5, 0.8, 1.5, 3.0, 6.0)
 """Weights of reflection beside texture that are compared."""
 
-LINE_WEIGHTS = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+LINE_WEIGHTS = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """Weights of the lines of points beside texture that are compared."""
 
 LINES_GAIN = 1.05
 """Least gain in agreement by lines of points. Beside a gap in the points they are often wrong,
 which costs straight hair more than it gains."""
+
+CLEAR = 10.0
+"""Contrast of highlights from which on the agreement of reflection counts whole beside lines."""
 
 MOST_RADIUS = 10e-3
 """Metres: hair turns within a centimetre."""
@@ -96,15 +99,17 @@ def chosen(
     radius: float | None = None,
     weight: float | None = None,
     lines: float | None = None,
+    contrast: float = CLEAR,
 ) -> Pooling:
     """The radius and weights by which half of the cameras predicts the other half best.
 
     `spacing` of `points (N, 3)` in metres. The direction that one half, pooled and weighted, scores
     highest is looked up in the other half at the point itself: too small a radius leaves noise, too
     large a one blurs hair that turns. The agreement is the mean score there in standard deviations;
-    0 by chance. Its sum over texture and lines decides; where lines add less than `LINES_GAIN`,
-    their weight is 0 and the sum over texture and reflection decides, whose halves share lights and
-    shadows. A given `radius` or weight stays.
+    0 by chance, summed over the kinds. Beside lines, reflection counts by the `contrast` of its
+    highlights, from 0 at 1 to 1 at `CLEAR`: its halves share lights and shadows, and agree on these
+    where highlights are faint. Lines that add less than `LINES_GAIN` have weight 0. A given
+    `radius` or weight stays.
 
     Without a point that both halves score, the agreement is 0 and `UNKNOWN_RADIUS` and
     `UNKNOWN_WEIGHT` are taken. Raises `ValueError` for scores that are not finite.
@@ -121,24 +126,23 @@ def chosen(
     radii = [r * spacing for r in RADII if r * spacing <= MOST_RADIUS] or [MOST_RADIUS]
     kinds = texture, evidence.reflection, evidence.lines
     own = [None if kind is None else [_standard(half[rows]) for half in kind] for kind in kinds]
-    plain = with_lines = Pooling(0.0, 0.0, 0.0, -np.inf)
-    without_lines = -np.inf  # the agreement of texture and lines
+    clear = 1.0 if evidence.lines is None else np.clip((contrast - 1) / (CLEAR - 1), 0, 1)
+    shares = 1.0, float(clear), 1.0
+    plain = best = Pooling(0.0, 0.0, 0.0, -np.inf)
     for r in radii if radius is None else [radius]:
         near = pool(points, r, NEIGHBOURS, rows)
         alone = [near @ half for half in texture]
         for first, w in _weighted(near, evidence.reflection, weight, WEIGHTS, alone):
             for both, c in _weighted(near, evidence.lines, lines, LINE_WEIGHTS, first):
-                best = [scores.argmax(axis=1) for scores in both]
-                each = [0.0 if kind is None else _agreement(best, kind) for kind in own]
-                found = Pooling(float(r), float(w), float(c), each[0] + each[2])
-                if found.agreement > with_lines.agreement:
-                    with_lines = found
-                if c == 0:
-                    without_lines = max(without_lines, found.agreement)
-                    if each[0] + each[1] > plain.agreement:
-                        plain = replace(found, agreement=each[0] + each[1])
-    gain = with_lines.lines > 0 and with_lines.agreement > LINES_GAIN * without_lines
-    return with_lines if gain else plain
+                tops = [scores.argmax(axis=1) for scores in both]
+                each = (0.0 if kind is None else _agreement(tops, kind) for kind in own)
+                total = sum(share * x for share, x in zip(shares, each, strict=True))
+                found = Pooling(float(r), float(w), float(c), total)
+                if total > best.agreement:
+                    best = found
+                if c == 0 and total > plain.agreement:
+                    plain = found
+    return best if best.lines > 0 and best.agreement > LINES_GAIN * plain.agreement else plain
 
 
 def _weighted(
@@ -165,10 +169,10 @@ def _standard(scores: Floats) -> Floats:
     return (scores - scores.mean(axis=1, keepdims=True)) / np.float32(spread if spread > 0 else 1.0)
 
 
-def _agreement(best: Sequence[Ints], standard: Sequence[Floats]) -> float:
-    """How high the `best (M,)` directions of two halves score in each other's `standard (M, D)`.
+def _agreement(tops: Sequence[Ints], standard: Sequence[Floats]) -> float:
+    """How high two halves' best directions `tops (M,)` score in each other's `standard (M, D)`.
 
     The sum of both ways.
     """
-    ways = zip(best, reversed(standard), strict=True)
+    ways = zip(tops, reversed(standard), strict=True)
     return sum(float(scores[np.arange(len(scores)), found].mean()) for found, scores in ways)
