@@ -204,7 +204,9 @@ def measure_tangents(
     saturation.record(stage)
     stage.figures["lines"] = condition_lines(evidences, len(points)).figures()
     second = [camera.name for camera in cameras[1::2]]
-    lines = halves_of_lines(points, cloud, second, scale.pixel, candidates)
+    lines = None
+    if options.line_weight != 0:
+        lines = halves_of_lines(points, cloud, second, scale.pixel, candidates)
     given = (options.radius, options.reflection_weight, options.line_weight)
     found = chosen(points, apart, Evidence(halves, lines=lines), *given)
     stage.figures["texture_radius_mm"] = 1e3 * found.radius
