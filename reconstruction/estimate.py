@@ -32,6 +32,7 @@ from reconstruction.reconstruct_options import LogGaborBank, ReconstructOptions
 from reconstruction.report.report import Progress, silent, usable_cores
 from reconstruction.stages import method_for
 from reconstruction.tangents.estimate import CANDIDATES, LIGHT_GROUPS, MOST_POINTS
+from reconstruction.tangents.point_lines import WIDEST_PIXEL
 from reconstruction.tangents.reflection import FEWEST_LIGHTS
 
 KNOWN_TASK = 0.0155
@@ -326,11 +327,10 @@ class _Probe:
         measured = self.frames(self.kind) * self.again + groups * self.filtering(bank)
         reads = lights if lights >= FEWEST_LIGHTS else 0
         table = n * ((2.2e-4 if reads else 0.9e-4) + 1.4e-6 * reads)
-        sweep = bool(self.capture.of_kind("scanline")) and self.options.measure.line_weight != 0
+        sweep = bool(self.capture.of_kind("scanline")) and self.pixel <= WIDEST_PIXEL
         table += sweep * (2.9e-4 * n + (14.0 if reads else 1.5) * min(n / 3000, 1.0))
         images = self.pixels * (5 * lights + 8 * min(LIGHT_GROUPS, lights) + 8 * bank.count + 60)
-        views = 0.7 + 0.3 * len(self.cameras)  # that see a point
-        scores, observed = 4 * CANDIDATES * n, views * n * reads * 5
+        scores, observed = 4 * CANDIDATES * n, (0.7 + 0.3 * len(self.cameras)) * n * reads * 5
         part = 0.35e9 * min(n / 2e4, 1.0)  # of scores being decided
         times = (8 if reads else 4.4) + 2 * sweep  # halves of each kind, sums and averages
         add("orientation", measured, table, max(images, times * scores + part + observed) / GB)

@@ -9,12 +9,16 @@ from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Floats
 from reconstruction.light_planes.point_cloud import PointCloud
+from reconstruction.tangents.pooling import MOST_RADIUS
 
 WIDTH = 1.4
 """Pixels across a line up to which a point counts."""
 
 REACH = 6.0
 """Pixels along it."""
+
+WIDEST_PIXEL = MOST_RADIUS / REACH
+"""Metres, 1.7 mm: pixels on the hair up to which points can show lines."""
 
 NEIGHBOURS, FEW = 64, 16
 """Most neighbours that count, and how many halve the score: few lie in a line by chance."""
@@ -27,9 +31,9 @@ def halves_of_lines(
 ) -> Floats | None:
     """`line_scores` `(2, N, D)` in the points of all cameras but the `second` ones, and in theirs.
 
-    None without any point.
+    None without any point, and where `REACH` is more than the distance in which hair turns.
     """
-    if not len(cloud):
+    if not len(cloud) or pixel > WIDEST_PIXEL:
         return None
     theirs = np.isin(cloud.camera, [cloud.cameras.index(name) for name in second])
     halves = (cloud.points[~theirs], cloud.points[theirs])

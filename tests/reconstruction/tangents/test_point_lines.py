@@ -85,3 +85,4 @@ def test_each_half_has_the_points_of_its_own_cameras(cloud_of: Callable[..., Poi
     assert halves[:, 0].argmax(axis=1).tolist() == [1, 0]
     empty = cloud_of(np.zeros((0, 3)), np.zeros(0), ["a", "b", "c"])
     assert halves_of_lines(np.zeros((1, 3)), empty, ["b"], PIXEL, towards) is None
+    assert halves_of_lines(np.zeros((1, 3)), cloud, ["b"], 2e-3, towards) is None  # 12 mm long

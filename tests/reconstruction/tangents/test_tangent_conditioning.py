@@ -87,7 +87,7 @@ def test_no_points_are_no_trouble() -> None:
     json.dumps(found.figures(), allow_nan=False)
 
 
-def meridians(lights: list[Light]) -> Callable[..., np.ndarray]:
+def meridians(lights: list[Light], stripes: int) -> Callable[..., np.ndarray]:
     """Draws a sphere of 10 cm with stripes along its meridians."""
 
     def draw(step: dict[str, object], camera: Camera) -> np.ndarray:
@@ -98,7 +98,7 @@ def meridians(lights: list[Light]) -> Callable[..., np.ndarray]:
         p = camera.center + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
         azimuth = np.arctan2(p[..., 1], p[..., 0])
         shade = p @ next(x for x in lights if x.name == step["light"]).position
-        bright = (1.2 + np.cos(40 * azimuth)) * (0.05 + np.maximum(shade, 0))
+        bright = (1.2 + np.cos(stripes * azimuth)) * (0.05 + np.maximum(shade, 0))
         return np.where(inside > 0, bright, 0.0)
 
     return draw
@@ -134,18 +134,19 @@ class Stage:
         stage_camera: Callable[..., Camera],
         count: int,
         azimuths: tuple[int, ...],
+        size: int = 80,
     ) -> Stage:
         places = enumerate(dome_positions(count, 1.2, 0.0))
         lights = [Light(f"l{i}", p, np.ones(3)) for i, p in places]
-        cameras = [stage_camera(f"c{a}", a, 0.0, size=80) for a in azimuths]
-        draw = meridians(lights)
+        cameras = [stage_camera(f"c{a}", a, 0.0, size=size) for a in azimuths]
+        draw = meridians(lights, size // 2)
         capture = shoot(cameras=cameras, projectors=[], lights=lights, extra=draw, samples=1)
-        whole = np.ones((80, 80), bool)
+        whole = np.ones((size, size), bool)
         masks = {c.name: HairMask(whole, whole, ~whole, "user", 1.0) for c in cameras}
         return cls(cameras, MaskedCapture(capture, masks))
 
     def measured(self, cloud: PointCloud, options: MeasureOptions) -> Measured:
-        depths = {c.name: np.full((80, 80), 0.85) for c in self.cameras}
+        depths = {c.name: np.full((c.height, c.width), 0.85) for c in self.cameras}
         scale = replace(CaptureScale.of(self.cameras, cloud.points), tolerance=0.1)
         return measure_tangents(self.masked, cloud, depths, scale, options)
 
@@ -168,7 +169,7 @@ def test_points_of_a_sweep_give_the_slope_that_cameras_side_by_side_do_not(
     stage_camera: Callable[..., Camera],
     cloud_of: Callable[..., PointCloud],
 ) -> None:
-    stage = Stage.of(shoot, stage_camera, 1, (-2, 2))
+    stage = Stage.of(shoot, stage_camera, 1, (-2, 2), 240)
     points = on_sphere(np.arange(0.045, 0.08, 1e-3), np.arange(-0.4, 0.4, 0.015))
     cloud = cloud_of(points, np.arange(len(points)) % 2, [c.name for c in stage.cameras])
     texture = off_meridians(stage.measured(cloud, MeasureOptions(line_weight=0.0)))
