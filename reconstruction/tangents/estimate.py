@@ -30,7 +30,7 @@ from reconstruction.tangents.line_evidence import (
     line_support,
     visible_from,
 )
-from reconstruction.tangents.point_lines import halves_of_lines
+from reconstruction.tangents.point_lines import WIDEST_PIXEL, halves_of_lines
 from reconstruction.tangents.pooling import Evidence, chosen, pool
 from reconstruction.tangents.reflection import (
     FEWEST_LIGHTS,
@@ -207,16 +207,25 @@ def measure_tangents(
     lines = None
     if options.line_weight != 0:
         lines = halves_of_lines(points, cloud, second, scale.pixel, candidates)
+    if lines is None and len(cloud):
+        stage.leave_out(
+            "lines in which points lie",
+            f"pixels of {1e3 * scale.pixel:.2g} mm are wider than {1e3 * WIDEST_PIXEL:.2g} mm"
+            if options.line_weight != 0
+            else "measure.line_weight is 0",
+            "part of this stage; slopes towards the cameras are less certain",
+        )
     given = (options.radius, options.reflection_weight, options.line_weight)
-    found = chosen(points, apart, Evidence(halves, lines=lines), *given)
+    evidence = Evidence(halves, lines=lines)
+    found = chosen(points, apart, evidence, *given)
     stage.figures["texture_radius_mm"] = 1e3 * found.radius
     near = pool(points, found.radius, options.neighbours)
-    tangents = decide(near @ found.total(Evidence(halves, lines=lines)), candidates)
+    tangents = decide(near @ found.total(evidence), candidates)
     if not reads:
         stage.leave_out(
             "directions from reflection",
             f"{len(lights)} lights are fewer than {FEWEST_LIGHTS}" if lights else NO_SINGLE_LIGHTS,
-            "the second half of this stage; directions come from texture alone",
+            "the second half of this stage; directions come from the rest",
         )
     else:
         progress("reflection", 0.6)

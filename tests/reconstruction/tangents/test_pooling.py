@@ -74,6 +74,8 @@ def test_faint_reflection_that_errs_alike_in_all_cameras_gets_no_weight_beside_p
     found = chosen(points, SPACING, Evidence(texture, wrong, lines), contrast=1.5)
     assert found.weight <= 0.3
     assert found.lines >= 4
+    clear = chosen(points, SPACING, Evidence(texture, wrong, lines), contrast=10.0)
+    assert clear.weight >= 0.8  # a clear highlight is believed
     assert chosen(points, SPACING, Evidence(texture, wrong)).weight >= 0.8
 
 
