@@ -151,7 +151,7 @@ def test_a_table_runs_from_its_first_step_to_its_last(box):
     until(lambda: driver.progress().state != "running")
     assert driver.progress() == TableProgress("done", 5, 5, "-")
     assert driver.count() == 6
-    until(lambda: closed(box))
+    until(lambda: len(times(box, "P", False)) == 3)
     order = [(name, up) for _, name, up in box.edges if name != "C"]
     both = {("L", True), ("P", True)}, {("L", False), ("P", False)}
     assert order[:2] == [("L", True), ("L", False)]
@@ -198,6 +198,7 @@ def test_an_armed_table_can_be_run_again(box):
 def test_stop_closes_the_gates_in_mid_step(box):
     running(box, TableRow(2, "L", 0.0, 0.001, 0.0), LONG)
     until(lambda: box.driver.progress().pulses == 3)
+    until(lambda: len(times(box, "L")) == 3)  # edges come by their own way, later than replies
     assert not closed(box)
     assert box.driver.stop() == 2
     until(lambda: closed(box))
@@ -226,6 +227,7 @@ def test_a_running_table_is_not_disturbed(box):
         with pytest.raises(DeviceError, match="ERR 4"):
             call()
     assert box.driver.count() == 1
+    until(lambda: len(times(box, "L")) == 1)
     assert not closed(box)
     box.driver.stop()
 
