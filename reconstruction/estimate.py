@@ -313,12 +313,12 @@ class _Probe:
         add("strands", table=traced, gb=grown)
         if bare:
             return out
-        if sweep:
-            add("refinement", table=2.0 + 3.3e-4 * n, gb=0.3 + 6e-6 * n)
-            add("roots", table=0.5 + 1.5e-5 * n, gb=0.2 + 5e-6 * n)
-        else:
-            add("refinement")
-            add("roots", table=1.5 + 3.3e-5 * n + 1.2e-4 * lines, gb=0.8 * grown)
+        refined = (2.0 + 3.3e-4 * n, 0.3 + 6e-6 * n) if sweep else (0.0, 0.0)
+        last = (1.5 + 3.3e-5 * n + 1.2e-4 * lines, 0.8 * grown)
+        add("refinement", 0.0, *refined)
+        if method != "hull":
+            add("hidden", table=(sweep > 0 and self.pixel <= WIDEST_PIXEL) * (3.0 + 3e-4 * n))
+        add("roots", 0.0, *((0.5 + 1.5e-5 * n, 0.2 + 5e-6 * n) if sweep else last))
         return out
 
     def _orientation(self, add: Callable[[str, float, float, float], None]) -> None:

@@ -14,6 +14,8 @@ from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.field import OrientationField, solve_field
 from reconstruction.growth.from_roots import Coverage, Tracing, fill_gaps, grow_from_roots
+from reconstruction.growth.hidden import hidden_strands, measured_density, seen_by
+from reconstruction.growth.lines import Surfaces
 from reconstruction.growth.refinement import refine, supported
 from reconstruction.growth.rooting import root_all
 from reconstruction.growth.thickness import covering_radii
@@ -21,10 +23,11 @@ from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.light_codes.line_strands import roots_first
 from reconstruction.light_planes import PointCloud
-from reconstruction.plausibility import check_face, check_inside, check_strands
+from reconstruction.plausibility import check_face, check_inside, check_strands, most_hairs
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
+from reconstruction.tangents.point_lines import WIDEST_PIXEL
 
 SPACING = 2e-3  # metres between a written strand's points
 SURE = 4.0  # voxels from a measured line within which the depth of hair is taken as measured
@@ -160,6 +163,57 @@ class GrowingStages(Stages):
             strands, figures = refine(strands, lines, o, surfaces, lines.apart, SURE * grid)
             stage.figures.update(figures)
         return strands
+
+    def with_hidden(
+        self,
+        strands: Strands,
+        scalp: Scalp | None,
+        envelope: VoxelGrid,
+        cloud: PointCloud,
+        surfaces: Surfaces,
+        pixel: float,
+    ) -> Strands:
+        """`strands`, and copies of them where the `envelope` holds hair that no camera sees.
+
+        Rooted where there is a `scalp`; `pixel` is the width of one on the hair, metres.
+        """
+        o = self.options
+        with self.report.stage("hidden") as stage:
+            density, why = None, self._unknown_density(cloud, pixel)
+            if why is None:
+                density = measured_density(cloud.points, o.hidden_density, o.seed)
+                why = "too few points lie close together"
+            if density is None:
+                stage.leave_out("hair that no camera sees", why, "this stage")
+                return strands
+            self.progress("filling hidden hair", 0.0)
+            own = [strands[i] for i in range(len(strands))]
+            more, figures = hidden_strands(
+                strands,
+                envelope,
+                density,
+                seen_by(surfaces, cloud, density.depth),
+                most=most_hairs(None if scalp is None else scalp.area) - len(strands),
+                seed=o.seed,
+            )
+            if scalp is not None:
+                more = root_all(own, more, scalp).strands[len(own) :]
+            out = Strands.from_list([*own, *more]).cut(o.max_length).resampled(SPACING)
+            stage.figures.update(figures, strands=len(out), metres=float(out.lengths().sum()))
+        return out
+
+    def _unknown_density(self, cloud: PointCloud, pixel: float) -> str | None:
+        """Why the density of hidden hair is unknown, None if it is not."""
+        if self.options.hidden_density == 0:
+            return "the options disable it"
+        if not len(cloud):
+            return "without a sweep nothing shows how far light gets into the hair"
+        if pixel > WIDEST_PIXEL:
+            return (
+                f"pixels of {1e3 * pixel:.2g} mm are wider than {1e3 * WIDEST_PIXEL:.2g} mm and do "
+                "not show how far light gets into the hair"
+            )
+        return None
 
     def rooted(
         self, strands: Strands, measured: Measured, scalp: Scalp | None, flat: ScalpMap | None

@@ -32,14 +32,14 @@ from reconstruction.tangents.estimate import MOST_DEVIATION, Measured
 
 FINE_PIXEL = 1e-3  # metres: line stereo fails on pixels twice as wide
 
-_SURFACE, _GROWN = ("scale", "envelope", "orientation"), ("field", "strands", "refinement", "roots")
+_SURFACE, _GROWN = ("scale", "envelope", "orientation"), ("field", "strands", "refinement")
 _LINES = ("lightcodes", "depth", "segments", "connection")
 STAGES: dict[str, tuple[str, ...]] = {
-    "light_planes": ("triangulation", "masks", *_SURFACE, "surface", *_GROWN),
-    "fused": ("triangulation", "masks", *_SURFACE, "surface", *_LINES, *_GROWN),
+    "light_planes": ("triangulation", "masks", *_SURFACE, "surface", *_GROWN, "hidden", "roots"),
+    "fused": ("triangulation", "masks", *_SURFACE, "surface", *_LINES, *_GROWN, "hidden", "roots"),
     "photometric": ("triangulation", "masks", *_LINES, "strands"),
     "lmvs": ("triangulation", "masks", *_LINES, "strands"),
-    "hull": ("masks", *_SURFACE, *_GROWN),
+    "hull": ("masks", *_SURFACE, *_GROWN, "roots"),
 }
 """The expected stages of each method, for the progress."""
 
@@ -147,7 +147,16 @@ class _Run:
             strands = growing.refined(
                 grown.strands, measured, cloud, masked.cameras, depths, scale.grid
             )
-            growing.rooted(strands, lines, scalp if grown.rooted else None, head.scalp_map)
+            rooted = scalp if grown.rooted else None
+            strands = growing.with_hidden(
+                strands,
+                rooted,
+                envelope,
+                cloud,
+                [(camera, depths[camera.name]) for camera in masked.cameras],
+                scale.pixel,
+            )
+            growing.rooted(strands, lines, rooted, head.scalp_map)
 
     def line_stereo(
         self, masked: MaskedCapture, head: FittedHead | None, method: Literal["photometric", "lmvs"]

@@ -98,6 +98,11 @@ def check_subject(masked: MaskedCapture, hull: VoxelGrid, stage: Stage) -> None:
         stage.warn(text)
 
 
+def most_hairs(area: float | None) -> int:
+    """The hairs that a scalp of `area` m² has at most; None: those of a head."""
+    return int(MOST_HAIRS if area is None else min(MOST_HAIRS, DENSEST * 1e4 * area))
+
+
 def check_strands(strands: Strands, area: float | None, stage: Stage) -> None:
     """Hold `strands` against hair; `area` is the scalp's, m², None if unknown."""
     longest = float(np.quantile(strands.lengths(), 0.95))
@@ -107,7 +112,7 @@ def check_strands(strands: Strands, area: float | None, stage: Stage) -> None:
             f"to {100 * LENGTHS[1]:g} cm: if the hair is not so, check the scale (hairstage import "
             "--unit)"
         )
-    most = MOST_HAIRS if area is None else min(MOST_HAIRS, DENSEST * 1e4 * area)
+    most = most_hairs(area)
     if len(strands) > most:
         where = "a head" if area is None else f"{1e4 * area:.0f} cm² of scalp"
         metres, bound = strands.lengths().sum(), most * strands.lengths().mean()

@@ -114,6 +114,8 @@ class ReconstructOptions:
     `scalp_points` is a file of digitised scalp points to fit a head to, `head_mesh` (OBJ) the head
     to fit instead of the generic one. Gaps are filled `within` metres of a measurement (None: 3 mm
     or two voxels, on a hull 12 mm); give more for wider pixels.
+    What no camera sees is filled with copies of the strands to `hidden_density` metres of hair in a
+    cubic centimetre (None: as the depths of a sweep's points show; 0: not at all).
     `radius` of the strands; None covers as much as a head of hair, less where strands are dense.
     `frame` is that of the written strands and head: of the user's cameras, for an imported capture,
     or the stage's.
@@ -127,6 +129,7 @@ class ReconstructOptions:
     scalp_points: str | None = None
     head_mesh: str | None = None
     within: Length | None = None
+    hidden_density: Factor | None = None
     radius: Length | None = None
     frame: Literal["user", "stage"] = "user"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0

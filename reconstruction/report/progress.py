@@ -26,6 +26,7 @@ SECONDS = {
     "field": 5,
     "strands": 13,
     "refinement": 22,
+    "hidden": 1,
     "roots": 3,
 }
 """Relative duration of reconstruction stages: of a sweep on the demo's capture, of line stereo on a
