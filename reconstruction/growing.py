@@ -208,10 +208,10 @@ class GrowingStages(Stages):
             return "the options disable it"
         if not len(cloud):
             return "without a sweep nothing shows how far light gets into the hair"
-        if pixel > WIDEST_PIXEL:
+        if pixel > WIDEST_PIXEL and self.options.hidden_density is None:
             return (
                 f"pixels of {1e3 * pixel:.2g} mm are wider than {1e3 * WIDEST_PIXEL:.2g} mm and do "
-                "not show how far light gets into the hair"
+                "not show how far light gets into the hair; option: hidden_density"
             )
         return None
 

@@ -140,6 +140,7 @@ def test_copies_have_the_shape_of_their_models() -> None:
 def test_no_copy_without_room_and_no_more_than_asked_for() -> None:
     grid = box(0.04, 0.04, 0.01)
     assert filled(waves(), grid, even(1e4)) == []
+    assert filled(waves(200), grid, even(2e5)) == []  # 8 m are seen where 3 m are expected
     assert (
         filled(waves(), grid, even(4e6), most=0) == filled(waves(), grid, even(4e6), most=-5) == []
     )
@@ -152,6 +153,7 @@ def test_no_copy_without_room_and_no_more_than_asked_for() -> None:
     [
         (0.5e-3, 3000, None, None),
         (0.5e-3, 3000, 1.0, None),
+        (1.8e-3, 3000, 1.0, None),
         (0.5e-3, 3000, 0.0, "options"),
         (0.5e-3, 0, None, "without a sweep"),
         (0.5e-3, 5, None, "too few points"),
