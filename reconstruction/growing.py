@@ -23,7 +23,7 @@ from reconstruction.head.scalp import Scalp, sample_roots
 from reconstruction.head.scalp_map import ScalpMap, write_root_map
 from reconstruction.light_codes.line_strands import roots_first
 from reconstruction.light_planes import PointCloud
-from reconstruction.plausibility import check_face, check_inside, check_strands, most_hairs
+from reconstruction.plausibility import check_face, check_inside, check_strands, usual_hairs
 from reconstruction.report.report import Stage
 from reconstruction.stages import LEAST_CONFIDENCE, Stages
 from reconstruction.tangents.estimate import Measured
@@ -193,7 +193,7 @@ class GrowingStages(Stages):
                 envelope,
                 density,
                 seen_by(surfaces, cloud, density.depth),
-                most=most_hairs(None if scalp is None else scalp.area) - len(strands),
+                most=usual_hairs(None if scalp is None else scalp.area) - len(strands),
                 seed=o.seed,
             )
             if scalp is not None:

@@ -27,7 +27,9 @@ MOST_LITRES = 60.0
 """No hair is larger: that of a person, or 2 m of a wall."""
 LENGTHS = 0.05, 2.0
 """Metres of the longest strands."""
-MOST_HAIRS = 150_000
+HAIRS, MOST_HAIRS = 125_000, 150_000
+SCALP = 0.065
+"""Square metres."""
 DENSEST = 300.0
 """Hairs per cm² of scalp."""
 OTHER_BODY = 0.25
@@ -98,9 +100,9 @@ def check_subject(masked: MaskedCapture, hull: VoxelGrid, stage: Stage) -> None:
         stage.warn(text)
 
 
-def most_hairs(area: float | None) -> int:
-    """The hairs that a scalp of `area` m² has at most; None: those of a head."""
-    return int(MOST_HAIRS if area is None else min(MOST_HAIRS, DENSEST * 1e4 * area))
+def usual_hairs(area: float | None) -> int:
+    """The hairs that a scalp of `area` m² has; None: those of a head."""
+    return int(HAIRS if area is None else HAIRS * min(area / SCALP, 1.0))
 
 
 def check_strands(strands: Strands, area: float | None, stage: Stage) -> None:
@@ -112,7 +114,7 @@ def check_strands(strands: Strands, area: float | None, stage: Stage) -> None:
             f"to {100 * LENGTHS[1]:g} cm: if the hair is not so, check the scale (hairstage import "
             "--unit)"
         )
-    most = most_hairs(area)
+    most = MOST_HAIRS if area is None else min(MOST_HAIRS, DENSEST * 1e4 * area)
     if len(strands) > most:
         where = "a head" if area is None else f"{1e4 * area:.0f} cm² of scalp"
         metres, bound = strands.lengths().sum(), most * strands.lengths().mean()
