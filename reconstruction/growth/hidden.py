@@ -83,10 +83,7 @@ def measured_density(
 
 
 class Room:
-    """How many metres of hair each cell of an envelope still takes, besides `strands`.
-
-    `total` in all cells, of which `taken`, also where there are more than a cell takes.
-    """
+    """How many metres of hair each cell of an envelope still takes, besides `strands`."""
 
     def __init__(self, envelope: VoxelGrid, density: Density, strands: Strands) -> None:
         self._grid, self._across = envelope, max(1, round(_CELL / envelope.spacing))
@@ -96,7 +93,7 @@ class Room:
         middle = envelope.centers(corner + (self._across - 1) / 2)
         self._left = np.zeros(int(np.prod(self._shape)))
         self._left[cells] = voxels * envelope.spacing**3 * density.at(middle)
-        self.total, self.taken = float(self._left.sum()), 0.0
+        self.total = float(self._left.sum())
         self.take(strands.resampled(_STEP).points)
 
     @property
@@ -112,7 +109,6 @@ class Room:
         """Count a strand's `points (N, 3)`, one each 2 mm; those outside the envelope take none."""
         inside = self._grid.index(points[self._grid.contains(points)])
         np.add.at(self._left, self._cells(inside), -_STEP)
-        self.taken += _STEP * len(inside)
 
     def _cells(self, voxels: Ints) -> Ints:
         return np.asarray(np.ravel_multi_index(tuple((voxels // self._across).T), self._shape))
@@ -145,8 +141,7 @@ def hidden_strands(
 
     For a place without enough hair one of the strands nearby is copied and moved there; models are
     the longest strands, of half of all length. What is `seen (N,)` of a copy's points `(N, 3)` is
-    cut off, and a copy is dropped of which less than half is where hair is missing. Where the
-    visible strands are too many, fewer copies are made.
+    cut off, and a copy is dropped of which less than half is where hair is missing.
     """
     rng = np.random.default_rng(seed)
     room = Room(envelope, density, strands)
@@ -163,7 +158,7 @@ def hidden_strands(
     places = envelope.centers(voxels[rng.permutation(len(voxels))[:_PLACES]])
     places = places[~seen(places)]
     found: list[Floats] = []
-    while len(found) < most and len(places) and room.taken < room.total:
+    while len(found) < most and len(places):
         places = places[room.free(places)]
         some, places = places[:_TOGETHER], places[_TOGETHER:]
         k = np.arange(1, min(_MODELS, len(models.points)) + 1)
