@@ -14,7 +14,7 @@ from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growing import GrowingStages
-from reconstruction.growth.hidden import FIBRE, Density, hidden_strands, measured_density
+from reconstruction.growth.hidden import FIBRE, Density, hidden_strands, measured_density, seen_by
 from reconstruction.head.scalp import find_scalp
 from reconstruction.light_planes import PointCloud
 from reconstruction.report.report import silent
@@ -145,6 +145,21 @@ def test_no_copy_without_room_and_no_more_than_asked_for() -> None:
     )
     assert len(filled(waves(), grid, even(4e6), most=7)) == 7
     assert filled(waves(1), grid, even(4e6)) != []  # one strand is model enough
+
+
+def test_behind_pixels_without_points_more_is_taken_as_seen(
+    cloud_of: Callable[..., PointCloud],
+) -> None:
+    """Points of the left half only; the surface is at z = 0."""
+    x, y = np.meshgrid(np.arange(-0.039, 0, 1e-4), np.arange(-0.039, 0.039, 1e-4))
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    cloud = cloud_of(points, np.zeros(len(points), int), ["above"])
+    seen = seen_by([(above(), np.full((200, 200), 1.0))], cloud, depth=1e-3)
+    depths = np.array([0.9e-3, 1.1e-3, 7.9e-3, 8.1e-3])
+    left, right = (np.stack([0 * depths + x, 0 * depths, -depths], axis=1) for x in (-0.02, 0.02))
+    assert seen(left).tolist() == [True, False, False, False]
+    assert seen(right).tolist() == [True, True, True, False]
+    assert not seen(right + np.array([0.1, 0, 0])).any()  # outside the image
 
 
 @pytest.mark.parametrize(
