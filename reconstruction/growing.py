@@ -188,14 +188,22 @@ class GrowingStages(Stages):
                 return strands
             self.progress("filling hidden hair", 0.0)
             own = [strands[i] for i in range(len(strands))]
+            hairs = usual_hairs(None if scalp is None else scalp.area)
             more, figures = hidden_strands(
                 strands,
                 envelope,
                 density,
                 seen_by(surfaces, cloud, density.depth),
-                most=usual_hairs(None if scalp is None else scalp.area) - len(strands),
+                most=hairs - len(own),
                 seed=o.seed,
             )
+            if len(own) + len(more) >= hairs:
+                stage.leave_out(
+                    f"{figures['still_missing_metres']:.0f} m of hidden hair",
+                    f"there are as many strands as the {hairs} hairs of "
+                    + ("a head" if scalp is None else "the scalp"),
+                    "strands",
+                )
             if scalp is not None:
                 more = root_all(own, more, scalp).strands[len(own) :]
             out = Strands.from_list([*own, *more]).cut(o.max_length).resampled(SPACING)

@@ -217,3 +217,6 @@ def test_copies_are_rooted_where_strands_are(
     assert np.abs(out.roots[:, 2] + 0.02).max() < 1.1e-3
     # 4 m in each of 32 cm³ would be 6,400 hairs of 2 cm: 650 cm² of scalp have 125,000 (Robbins)
     assert len(out) == pytest.approx(125_000 * 16 / 650, abs=1)
+    assert (
+        "as many strands as the 3076 hairs of the scalp" in stages.report["hidden"].left_out[0].why
+    )
