@@ -193,7 +193,7 @@ class GrowingStages(Stages):
                 strands,
                 envelope,
                 density,
-                seen_by(surfaces, cloud, density.depth),
+                seen_by(surfaces, cloud, strands, density.depth),
                 most=hairs - len(own),
                 seed=o.seed,
             )

@@ -101,6 +101,14 @@ def depth_map(camera: Camera, points: AnyFloats) -> Array:
     return out.reshape(camera.height, camera.width)
 
 
+def nearest_depth(camera: Camera, points: AnyFloats) -> Array:
+    """Depth `(H, W)` along z, metres: that of a pixel's nearest point, 0 without any."""
+    visible, x, y, depth = camera.pixels_of(points)
+    out = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(out, (y[visible], x[visible]), depth[visible])
+    return np.where(np.isfinite(out), out, 0.0)
+
+
 def mesh_depth(camera: Camera, mesh: Mesh) -> Array:
     """Depth `(H, W)` along z of the mesh's nearest surface, infinite off the mesh.
 

@@ -16,6 +16,7 @@ from reconstruction.geometry.mesh_queries import (
     inside_mesh,
     mesh_depth,
     mesh_silhouette,
+    nearest_depth,
 )
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.images.visual_hull import first_depth, space_carve, trim_edges, visual_hull
@@ -71,7 +72,7 @@ def build_envelope(
     for camera in cameras:
         depth = depths[camera.name]
         unknown = masks[camera.name].hair & (depth == 0)
-        depths[camera.name] = np.where(unknown, depth_map_first(camera, envelope), depth)
+        depths[camera.name] = np.where(unknown, nearest_depth(camera, envelope.centers()), depth)
     litres = 1e3 * grid**3
     stage.figures.update(
         hull_litres=float(hull.inside.sum() * litres),
@@ -123,7 +124,7 @@ def build_hull(
     check_volume(masked, hull, "the visual hull", stage)
     stage.warn("no head: the volume under the hair counts as hair, and strands have no roots")
     depths = {
-        c.name: np.where(masked.masks[c.name].hair, depth_map_first(c, envelope), 0.0)
+        c.name: np.where(masked.masks[c.name].hair, nearest_depth(c, envelope.centers()), 0.0)
         for c in masked.cameras
     }
     return envelope, hull.inside & ~envelope.inside, depths
@@ -150,14 +151,6 @@ def _holding(grid: VoxelGrid, points: Array) -> Bools:
     flat = np.ravel_multi_index(tuple(index.T), grid.inside.shape)
     counts = np.bincount(flat, minlength=grid.inside.size)
     return np.asarray(counts.reshape(grid.inside.shape) >= 2)
-
-
-def depth_map_first(camera: Camera, envelope: VoxelGrid) -> Array:
-    """Depth `(H, W)` at which each pixel's ray meets the envelope, 0 where it does not."""
-    visible, x, y, depth = camera.pixels_of(envelope.centers())
-    out = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(out, (y[visible], x[visible]), depth[visible])
-    return np.where(np.isfinite(out), out, 0.0)
 
 
 def _bounds(masked: MaskedCapture, cloud: PointCloud, head: Mesh, longest: float) -> Array:

@@ -13,10 +13,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import AnyFloats, Array, Bools, Floats, Ints
-from reconstruction.geometry.mesh_queries import depth_map
+from reconstruction.geometry.cameras import Camera
+from reconstruction.geometry.mesh_queries import depth_map, nearest_depth
 from reconstruction.geometry.strands import Strands
 from reconstruction.geometry.voxels import VoxelGrid
 from reconstruction.growth.lines import Surfaces
@@ -36,6 +38,7 @@ the median."""
 
 _CELL = 4e-3  # metres: an edge of the cells in which hair is counted
 _STEP = 2e-3  # metres between the points that count
+_GAP = 2e-3  # metres between points or strands that cover what is behind
 _SHORTEST = 10e-3  # metres below which a copy is dropped, as a strand through a gap is
 _MODELS = 64  # nearest points of strands, one of which is copied to a place
 _TOGETHER = 2000
@@ -114,18 +117,35 @@ class Room:
         return np.asarray(np.ravel_multi_index(tuple((voxels // self._across).T), self._shape))
 
 
-def seen_by(surfaces: Surfaces, cloud: PointCloud, depth: float) -> Callable[[AnyFloats], Bools]:
+def seen_by(
+    surfaces: Surfaces, cloud: PointCloud, strands: Strands, depth: float
+) -> Callable[[AnyFloats], Bools]:
     """Whether some camera may see each of some points `(N, 3)`.
 
-    Up to `depth` behind its `surfaces` where it has points of the `cloud`. Elsewhere a surface is
-    the envelope's, which may be before the hair: there up to `AROUND` behind it.
+    Up to `depth` behind the hair that its pixels show: where it has points of the `cloud` its
+    `surfaces`, elsewhere the first strand, or either within `_GAP` of them. Where there is none, a
+    surface is only the envelope's and may be before the hair: there up to `AROUND` behind it.
     """
-    measured, others = [], []
+    dense = strands.resampled(_STEP).points
+    known, others = [], []
     for camera, surface in surfaces:
-        has = depth_map(camera, cloud.of_camera(camera.name).points) > 0
-        measured.append((camera, np.where(has, surface, 0.0)))
-        others.append((camera, np.where(has, 0.0, surface)))
-    return lambda points: exposed(points, measured, depth) | exposed(points, others, AROUND)
+        own = depth_map(camera, cloud.of_camera(camera.name).points)
+        first = _without_gaps(camera, nearest_depth(camera, dense))
+        near = np.where(own > 0, surface, _without_gaps(camera, own))
+        near = np.where(near > 0, near, np.where(first > 0, np.maximum(first, surface), 0.0))
+        near = np.where(surface > 0, near, 0.0)
+        known.append((camera, near))
+        others.append((camera, np.where(near > 0, 0.0, surface)))
+    return lambda points: exposed(points, known, depth) | exposed(points, others, AROUND)
+
+
+def _without_gaps(camera: Camera, depth: Array) -> Array:
+    """`depth (H, W)`, that of the nearest known pixel within `_GAP` where it is 0."""
+    if not depth.any():
+        return depth
+    pixels, (y, x) = ndimage.distance_transform_edt(depth == 0, return_indices=True)
+    near = depth[y, x]
+    return np.where(pixels * near <= _GAP * camera.K[0, 0], near, 0.0)
 
 
 def hidden_strands(

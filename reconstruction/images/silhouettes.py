@@ -18,6 +18,7 @@ DARKEST = 0.05  # of the 95th percentile: a mode above it is the subject
 MOST_SATURATED = 0.02
 MOST_LIGHTS = 32  # that are compared with a lit background
 LIKE_BACKGROUND = 1.5  # times its radiance
+AS_ONE = 0.9  # least cosine of the angle between a background's changes; hair has up to 0.86
 SMALLEST = 6  # pixels: smaller specks are noise
 NO_SINGLE_LIGHTS = "there are no single lights"
 
@@ -168,8 +169,8 @@ def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
     radiance under the single lights is at most `LIKE_BACKGROUND` times the median's at the edges
     outside of the user's hair mask, or in proportion to it up to twice that. What remains is
     connected to the hair. The mask is returned as it is if it covers under half of the edges, if
-    they differ from each other, as those of hair that fills an image do, or if nothing is much
-    brighter.
+    they differ from each other in radiance or in how they change, as those of hair that fills an
+    image do, or if nothing is much brighter.
     """
     edge, hair = edges(mask), capture.mask(camera)
     if hair is not None:
@@ -178,17 +179,21 @@ def without_lit_background(capture: Capture, camera: str, mask: Bools) -> Bools:
     steps = steps[:: max(1, len(steps) // MOST_LIGHTS)]
     if len(steps) < 2 or 2 * int((mask & edge).sum()) <= int(edge.sum()):
         return mask
-    with_edge, square, total = np.zeros((2, *mask.shape)), np.zeros(mask.shape), 0.0
+    # single pixels, and their neighbourhoods, in which noise changes less
+    with_edge, square, total = *np.zeros((2, 2, *mask.shape)), 0.0
     for step in steps:
         image = grey(dark_response(capture, step, camera)[0]).astype(float)
         level = float(np.median(image[edge]))
-        with_edge[0] += level * image
-        square += image**2
+        both = np.stack([image, cv2.blur(image, (3, 3))])
+        with_edge += level * both
+        square += both**2
         total += level**2
-    ratio = np.sqrt(square / max(total, 1e-300))
-    alike = with_edge[0] / np.maximum(np.sqrt(square * total), 1e-300)
+    ratio = np.sqrt(square[0] / max(total, 1e-300))
+    alike, nearby = with_edge / np.maximum(np.sqrt(square * total), 1e-300)
     behind = (ratio < LIKE_BACKGROUND) | ((ratio < 2 * LIKE_BACKGROUND) & (alike > 0.97))
-    if behind[edge].mean() < 0.5 or np.quantile(ratio, 0.98) < 2.5 * LIKE_BACKGROUND:
+    if behind[edge].mean() < 0.5 or np.median(nearby[edge]) < AS_ONE:
+        return mask
+    if np.quantile(ratio, 0.98) < 2.5 * LIKE_BACKGROUND:
         return mask
     kept = mask & ~behind
     if hair is None:

@@ -147,19 +147,26 @@ def test_no_copy_without_room_and_no_more_than_asked_for() -> None:
     assert filled(waves(1), grid, even(4e6)) != []  # one strand is model enough
 
 
-def test_behind_pixels_without_points_more_is_taken_as_seen(
+def test_cameras_see_up_to_measured_points_and_strands_or_else_into_the_envelope(
     cloud_of: Callable[..., PointCloud],
 ) -> None:
-    """Points of the left half only; the surface is at z = 0."""
+    """Points at z = 0 on the left, strands at z = -6 mm at x = 20 mm; the envelope is at z = 0."""
     x, y = np.meshgrid(np.arange(-0.039, 0, 1e-4), np.arange(-0.039, 0.039, 1e-4))
     points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    points = points[np.hypot(x + 0.02, y).ravel() > 1.8e-3]  # a hole is covered by what is around
     cloud = cloud_of(points, np.zeros(len(points), int), ["above"])
-    seen = seen_by([(above(), np.full((200, 200), 1.0))], cloud, depth=1e-3)
-    depths = np.array([0.9e-3, 1.1e-3, 7.9e-3, 8.1e-3])
-    left, right = (np.stack([0 * depths + x, 0 * depths, -depths], axis=1) for x in (-0.02, 0.02))
-    assert seen(left).tolist() == [True, False, False, False]
-    assert seen(right).tolist() == [True, True, True, False]
-    assert not seen(right + np.array([0.1, 0, 0])).any()  # outside the image
+    along = np.linspace(-0.01, 0.01, 21)
+    low = Strands.from_list([np.stack([0 * along + 0.02, along, 0 * along - 6e-3], axis=1)])
+    seen = seen_by([(above(), np.full((200, 200), 1.0))], cloud, low, depth=1e-3)
+    depths = np.array([0.9e-3, 1.1e-3, 6.9e-3, 7.1e-3, 7.9e-3, 8.1e-3])
+
+    def at(x: float) -> list[bool]:
+        return seen(np.stack([0 * depths + x, 0 * depths, -depths], axis=1)).tolist()
+
+    assert at(-0.02) == at(-0.01) == [True, False, False, False, False, False]
+    assert at(0.02) == at(0.0217) == [True, True, True, False, False, False]
+    assert at(0.01) == at(0.0225) == [True, True, True, True, True, False]
+    assert at(0.12) == [False] * 6  # outside the image
 
 
 @pytest.mark.parametrize(
