@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from reconstruction.arrays import Array, Bools
 from reconstruction.capture.records import CaptureError
-from reconstruction.geometry.cameras import Camera
 from reconstruction.geometry.mesh import Mesh
 from reconstruction.geometry.mesh_queries import (
     depth_map,

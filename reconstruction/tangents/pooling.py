@@ -75,13 +75,14 @@ class Pooling:
     """The `radius` of averages, metres, and weights beside texture.
 
     `weight` of reflection, `lines` of the lines of points. `agreement` of two halves of the
-    cameras, see `chosen`.
+    cameras and its standard `error`, see `chosen`.
     """
 
     radius: float
     weight: float
     lines: float
     agreement: float
+    error: float = 0.0
 
     def total(self, evidence: Evidence) -> Floats:
         """The weighted scores of both halves `(N, D)`."""
@@ -111,6 +112,10 @@ def chosen(
     where highlights are faint. Lines that add less than `LINES_GAIN` have weight 0. A given
     `radius` or weight stays.
 
+    Texture and reflection have blur of their own and do not show all that an average blurs. So the
+    smallest radius is taken whose agreement is within a standard error of the best (Breiman et al.
+    1984, §3.4.3), and of these the largest weight of lines.
+
     Without a point that both halves score, the agreement is 0 and `UNKNOWN_RADIUS` and
     `UNKNOWN_WEIGHT` are taken. Raises `ValueError` for scores that are not finite.
     """
@@ -128,7 +133,7 @@ def chosen(
     own = [None if kind is None else [_standard(half[rows]) for half in kind] for kind in kinds]
     clear = 1.0 if evidence.lines is None else np.clip((contrast - 1) / (CLEAR - 1), 0, 1)
     shares = 1.0, float(clear), 1.0
-    plain = best = Pooling(0.0, 0.0, 0.0, -np.inf)
+    tried: list[Pooling] = []
     for r in radii if radius is None else [radius]:
         near = pool(points, r, NEIGHBOURS, rows)
         alone = [near @ half for half in texture]
@@ -136,13 +141,19 @@ def chosen(
             for both, c in _weighted(near, evidence.lines, lines, LINE_WEIGHTS, first):
                 tops = [scores.argmax(axis=1) for scores in both]
                 each = (0.0 if kind is None else _agreement(tops, kind) for kind in own)
-                total = sum(share * x for share, x in zip(shares, each, strict=True))
-                found = Pooling(float(r), float(w), float(c), total)
-                if total > best.agreement:
-                    best = found
-                if c == 0 and total > plain.agreement:
-                    plain = found
-    return best if best.lines > 0 and best.agreement > LINES_GAIN * plain.agreement else plain
+                total = np.asarray(sum(share * x for share, x in zip(shares, each, strict=True)))
+                error = float(total.std() / np.sqrt(total.size))
+                tried.append(Pooling(float(r), float(w), float(c), float(total.mean()), error))
+    plain, best = [p for p in tried if p.lines == 0], max(tried, key=_agreed)
+    if plain and best.agreement <= LINES_GAIN * max(plain, key=_agreed).agreement:
+        tried, best = plain, max(plain, key=_agreed)
+    enough = [p for p in tried if p.agreement >= best.agreement - best.error]
+    least = min(p.radius for p in enough)
+    return max((p for p in enough if p.radius == least), key=lambda p: (p.lines, p.agreement))
+
+
+def _agreed(pooling: Pooling) -> float:
+    return pooling.agreement
 
 
 def _weighted(
@@ -169,10 +180,11 @@ def _standard(scores: Floats) -> Floats:
     return (scores - scores.mean(axis=1, keepdims=True)) / np.float32(spread if spread > 0 else 1.0)
 
 
-def _agreement(tops: Sequence[Ints], standard: Sequence[Floats]) -> float:
+def _agreement(tops: Sequence[Ints], standard: Sequence[Floats]) -> Floats:
     """How high two halves' best directions `tops (M,)` score in each other's `standard (M, D)`.
 
-    The sum of both ways.
+    `(M,)`, the sum of both ways.
     """
-    ways = zip(tops, reversed(standard), strict=True)
-    return sum(float(scores[np.arange(len(scores)), found].mean()) for found, scores in ways)
+    first, second = standard
+    row = np.arange(len(first))
+    return np.asarray(second[row, tops[0]] + first[row, tops[1]])
