@@ -15,7 +15,7 @@ from benchmarks.command import CACHE, ONLY, Benchmark, LeftOut, option, within
 from benchmarks.pictures import picture_strands
 from benchmarks.pixels.rig import PITCHES, SUBJECTS, TUNING, patch_capture
 from benchmarks.results import save
-from benchmarks.strand_truth import StrandTruth, write_hair_masks
+from benchmarks.strand_truth import StrandTruth
 from reconstruction import (
     Capture,
     CaptureError,
@@ -66,7 +66,6 @@ def _cell(args: argparse.Namespace, name: str, pitch: float, progress: Progress)
     simulated, ball = patch_capture(name, pitch, args.cache, spp=spp, seed=args.seed)
     folder, truth_folder = simulated.make(args.cache, within(progress, "capture", 0.0, 0.6))
     capture = Capture(folder)
-    write_hair_masks(capture, truth_folder)
     truth = StrandTruth(capture, truth_folder, ball, SAMPLES)
     options = ReconstructOptions(max_length=SUBJECTS[name].longest, seed=args.seed)
     variants: dict[str, Any] = {}
