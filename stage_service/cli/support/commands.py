@@ -238,6 +238,10 @@ def read_json(text: str | Path | None) -> dict[str, Any]:
     inline = str(text).lstrip().startswith("{")
     try:
         found = parse_json(str(text) if inline else Path(text).read_bytes())
+    except FileNotFoundError as error:
+        raise BadArgument(
+            f"{text}: no such file; give a JSON object, '{{\"name\": value}}', or a file of one"
+        ) from error
     except ValueError as error:
         raise BadArgument(f"{text} is not JSON: {error}") from error
     if not isinstance(found, dict):

@@ -293,6 +293,7 @@ def test_evaluate_geometry_prints_the_thresholds(capsys, tmp_path):
             "list.json: expected an object",
         ),
         ("fit c m --options {tmp}/bytes", "bytes is not JSON"),
+        ("fit c m --options steps=3", "steps=3: no such file; give a JSON object"),
         (
             'fit c m --field additive --field-options \'{{"field": "none"}}\'',
             "use --field",
